@@ -263,7 +263,7 @@ def test_a_cluster_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPa
 @pytest.mark.slow
 def test_ctrl_c_stops_all_workers(tmp_path: Path) -> None:
     long = ["study", str(CONFIGS / "study_demo.yaml"), "--out", str(tmp_path / "s"), "--parallel", "2"]
-    long += ["--set", "study.repeats=1000", "--set", "evaluator=interpreted"]
+    long += ["--set", "study.folds=100", "--set", "evaluator=interpreted"]
     process = subprocess.Popen(
         [sys.executable, "-m", "armcal.cli", *long],
         stdout=subprocess.DEVNULL,

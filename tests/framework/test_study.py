@@ -221,19 +221,6 @@ def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: 
 
 
 @pytest.mark.slow
-def test_repeats_draw_the_folds_anew_and_average(place: Path, ladder) -> None:
-    path = _write(place, SMALL)
-    both = _run(path, "study.repeats=2")
-    singles = [ladder, _run(path, "study.seed=3")]
-    for name in ("angles", "lengths"):
-        rows = [each.variant(name) for each in singles]
-        assert not np.array_equal(rows[0].errors_mm, rows[1].errors_mm)
-        assert np.allclose(both.variant(name).errors_mm, np.mean([r.errors_mm for r in rows], axis=0), rtol=1e-12)
-        assert both.variant(name).crossed.p95 == pytest.approx(np.mean([r.crossed.p95 for r in rows]))
-        assert both.variant(name).crossed.count == 200
-
-
-@pytest.mark.slow
 def test_studies_are_the_same_on_any_workers(place: Path) -> None:
     path = _write(place, SMALL)
     one, other = _run(path, "study.nested=true"), _run(path, "study.nested=true", executor=Workers("loky", 2))

@@ -115,7 +115,6 @@ def _variants(result: StudyResult) -> Table:
         rows.append((v.name, count(v.free), *train, *judged, *moved, *(turned or []), f"{v.fit_seconds:.2f} s"))
     words = f"Distance between measured and predicted, {result.unit}; cross-validated but for training: "
     words += f"{plural(len(result.dataset), 'record')}, {result.folds} folds"
-    words += f" drawn {result.repeats} times" if result.repeats > 1 else ""
     turns = ("Turn, deg", "Turn 95 %") if any(v.turns for v in result.variants) else ()
     names = ("Free", "Train", "Train 95 %", "Mean", "RMS", "95 %", "Max", "Change", "± se", "Helps", *turns, "Fit")
     return Table(words, ("Variant", *names), rows, page_only=("Train 95 %", "RMS", "Max", "Fit", "Turn 95 %"))

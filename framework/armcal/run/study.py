@@ -4,7 +4,7 @@ With ``group_by`` each variant is also trained at each group of records alone an
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -59,7 +59,7 @@ class StudySettings(Settings):
     """Variants compared by cross-validation, all on the same folds of the same records.
 
     Without ``variants`` the configuration itself is the only one. ``reference`` is what each is compared with: a
-    variant, or ``previous`` for a ladder. ``repeats`` draws the folds anew. ``nested`` chooses a variant inside each
+    variant, or ``previous`` for a ladder. ``nested`` chooses a variant inside each
     fold's training records and judges the choice on the fold. ``blocks`` is the number of neighbouring records that
     are resampled together for standard errors. ``group_by`` is a text column of the data, or ``payload``: each variant
     is also trained at each of its groups, and judged at each.
@@ -68,7 +68,6 @@ class StudySettings(Settings):
     variants: dict[str, Any] = Field(default_factory=dict)
     reference: str = PREVIOUS
     folds: Annotated[int, Field(ge=2)] = 5
-    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
     nested: bool = False
     blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
@@ -91,7 +90,7 @@ class VariantResult:
     """One variant, judged.
 
     Attributes:
-        crossed: errors of each record by a fit that did not see it (mm), the mean of each figure over the repeats.
+        crossed: errors of each record by a fit that did not see it (mm).
         turns: errors of orientations (deg), where they are measured beside lengths: ``nominal``, ``train``,
             ``cross_validated``.
     """
@@ -102,7 +101,7 @@ class VariantResult:
     train: ErrorSummary  # errors of a fit on all records, on the same records (mm)
     crossed: ErrorSummary
     at_rest: ErrorSummary  # the same if nothing is known of a drift; equal where nothing drifts
-    errors_mm: Array  # ``crossed`` record by record, mean over the repeats (N; nan where a fold did not converge)
+    errors_mm: Array  # ``crossed`` record by record (N; nan where a fold did not converge)
     change: Change | None  # against the variant it is compared with (mm); None for the reference itself
     converged: bool  # whether the fit on all records did
     failed_folds: int  # how many fits of the cross-validation did not converge
@@ -174,7 +173,6 @@ class StudyResult:
     dataset: Dataset
     simulated: bool
     folds: int
-    repeats: int
     variants: tuple[VariantResult, ...]  # in the order written
     best: str  # the lowest cross-validated mean error, of those whose fits all converged
     simplest: str  # the fewest parameters within one standard error of it
@@ -201,7 +199,6 @@ class StudyResult:
             "study": self.name,
             "records": len(self.dataset),
             "folds": self.folds,
-            "repeats": self.repeats,
             "variants": [variant.as_dict() for variant in self.variants],
             "lowest": self.best,
             "simplest_within_one_standard_error": self.simplest,
@@ -311,28 +308,26 @@ def _require_same_records(ready: Mapping[str, Prepared]) -> None:
 
 @dataclass(frozen=True)
 class _Training:
-    """Records that train, all or those of one group; ``drawn`` are folds of them, drawing by drawing."""
+    """Records that train, all or those of one group, and folds of them."""
 
     groups: tuple[str, ...]
     train: Indices
-    drawn: tuple[tuple[Split, ...], ...]
+    folds: tuple[Split, ...]
     count: int  # of all records
 
     @property
     def splits(self) -> list[Split]:
         """Judged everywhere by the fit to all that train; then the folds."""
-        return [Split(self.train, np.arange(self.count, dtype=np.intp)), *chain.from_iterable(self.drawn)]
+        return [Split(self.train, np.arange(self.count, dtype=np.intp)), *self.folds]
 
-    def errors(self, fits: Sequence[JudgedFit]) -> tuple[Array, Array, Array]:
-        """Errors, the same at rest (mm) and turns (deg), by drawing and record, each of a fit that did not see it."""
-        rows = np.full((3, len(self.drawn), self.count), np.nan)
-        elsewhere, rest = np.ones(self.count, dtype=bool), iter(fits[1:])
+    def errors(self, fits: Sequence[JudgedFit]) -> Array:
+        """Errors, the same at rest (mm) and turns (deg) of each record by a fit that did not see it (3 x N)."""
+        rows, elsewhere = np.full((3, self.count), np.nan), np.ones(self.count, dtype=bool)
         elsewhere[self.train] = False
-        rows[:, :, elsewhere] = _stacked(fits[0])[:, None, elsewhere]
-        for number, splits in enumerate(self.drawn):
-            for split in splits:
-                rows[:, number, split.holdout] = _stacked(next(rest))
-        return rows[0], rows[1], rows[2]
+        rows[:, elsewhere] = _stacked(fits[0])[:, elsewhere]
+        for split, own in zip(self.folds, fits[1:], strict=True):
+            rows[:, split.holdout] = _stacked(own)
+        return rows
 
 
 def _stacked(fit: JudgedFit) -> Array:
@@ -365,7 +360,7 @@ def compare(
             for rows in groups.values():
                 _naming(name, partial(_require_solvable, own, rows))
     whole, *parts = _trainings(groups, settings, poses)
-    inner = [_drawn(outer.train, settings, poses) for outer in whole.drawn[0]] if settings.nested else []
+    inner = [_folds(outer.train, settings, poses) for outer in whole.folds] if settings.nested else []
     splits = [split for training in (whole, *parts) for split in training.splits]
     plan = [(name, split) for name in ready for split in (*splits, *chain.from_iterable(inner))]
     fits, count = _fits(study, ready, plan, executor, progress, watch), len(plan) // len(ready)
@@ -380,16 +375,15 @@ def compare(
         dataset=dataset,
         simulated=first.settings.data is None,
         folds=settings.folds,
-        repeats=settings.repeats,
         variants=variants,
         best=best,
         simplest=simplest,
-        nested=_nested(by_name, whole.drawn[0], inner, len(splits)) if inner else None,
+        nested=_nested(by_name, whole.folds, inner, len(splits)) if inner else None,
         group_by=settings.group_by,
         labels=labels,
         groups={name: len(rows) for name, rows in groups.items()},
         cells=tuple(cell for name, own in trained.items() for cell in _cells(name, ready[name], own, groups)),
-        trained_mm={(n, at): o.errors_mm.mean(axis=0) for n, own in trained.items() for at, o in own.items()},
+        trained_mm={(n, at): o.errors_mm for n, own in trained.items() for at, o in own.items()},
         warnings=_warnings(ready, variants),
         seconds=watch.seconds,
         provenance=first.provenance(dataset),
@@ -425,14 +419,11 @@ def _trainings(groups: Mapping[str, Indices], settings: StudySettings, poses: In
     """All records, and those of each group."""
     listed: dict[tuple[str, ...], Indices] = {tuple(groups): np.arange(len(poses), dtype=np.intp)}
     listed |= {(name,): rows for name, rows in groups.items()}
-    return [
-        _Training(names, rows, tuple(_drawn(rows, settings, poses, r) for r in range(settings.repeats)), len(poses))
-        for names, rows in listed.items()
-    ]
+    return [_Training(names, rows, _folds(rows, settings, poses), len(poses)) for names, rows in listed.items()]
 
 
-def _drawn(train: Indices, settings: StudySettings, poses: Indices, repeat: int = 0) -> tuple[Split, ...]:
-    inside = folds(len(train), settings.folds, settings.seed + repeat, poses[train])
+def _folds(train: Indices, settings: StudySettings, poses: Indices) -> tuple[Split, ...]:
+    inside = folds(len(train), settings.folds, settings.seed, poses[train])
     return tuple(Split(train[split.train], train[split.holdout]) for split in inside)
 
 
@@ -485,16 +476,16 @@ def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], whole: _Train
         turns = {
             "nominal": summarise(nominal_turns),
             "train": summarise(np.degrees(of_all.turns)),
-            "cross_validated": _averaged(turned),
+            "cross_validated": summarise(turned),
         }
     return VariantResult(
         name=name,
         free=ready.problem.increments,
         nominal=summarise(nominal),
         train=summarise(of_all.errors * _MM),
-        crossed=_averaged(errors),
-        at_rest=_averaged(at_rest),
-        errors_mm=errors.mean(axis=0),
+        crossed=summarise(errors),
+        at_rest=summarise(at_rest),
+        errors_mm=errors,
         change=None,
         converged=of_all.converged,
         failed_folds=sum(not fit.converged for fit in own[1:]),
@@ -509,15 +500,6 @@ def _nominal(ready: Prepared) -> tuple[Array, Array | None]:
     problem = untrained(ready.problem)
     errors, turns = errors_and_turns(problem.with_records(ready.problem.records), problem.parameters.nominal())
     return errors * _MM, None if turns is None else np.degrees(turns)
-
-
-def _averaged(drawings: Array) -> ErrorSummary:
-    """Each figure's mean over the drawings of folds (drawings x N)."""
-    summaries, means = [summarise(row) for row in drawings], {}
-    for field in fields(ErrorSummary):
-        known = [value for s in summaries if (value := getattr(s, field.name)) is not None]
-        means[field.name] = float(np.mean(known)) if known else None
-    return ErrorSummary(means["mean"], means["rms"], means["p95"], means["max"], min(s.count for s in summaries))
 
 
 def _compared(plain: Sequence[VariantResult], settings: StudySettings) -> tuple[VariantResult, ...]:
@@ -589,7 +571,7 @@ def _nested(
 
 @dataclass(frozen=True)
 class _Trained:
-    errors_mm: Array  # by drawing and record
+    errors_mm: Array  # by record
     turns_deg: Array
     failed_fits: int
 
@@ -611,16 +593,16 @@ def _cells(
     """Without calibration, then by what was trained at, group by group."""
     nominal, turned = _nominal(ready)
     before = np.full(len(nominal), np.nan) if turned is None else turned
-    rows = {(): _Trained(nominal[None], before[None], 0), **trained}
+    rows = {(): _Trained(nominal, before, 0), **trained}
     return [
         Cell(
             name,
             at,
             group,
-            _averaged(own.errors_mm[:, members]),
+            summarise(own.errors_mm[members]),
             group in at,
             own.failed_fits,
-            None if turned is None else _averaged(own.turns_deg[:, members]),
+            None if turned is None else summarise(own.turns_deg[members]),
         )
         for at, own in rows.items()
         for group, members in groups.items()
