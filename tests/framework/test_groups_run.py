@@ -95,10 +95,10 @@ def test_the_arm_is_found_from_the_trained_positions(run):
 def test_errors_of_each_position_are_distances_to_its_sockets(run, data):
     """Fitted sockets where they were trained on, means of the postures elsewhere and before."""
     found, nominal = co.by_name(run.estimate.parameters, run.estimate.values), co.named(LEFT, "left")
-    assert [each.name for each in run.groups.errors] == ["back", "front", "shelf"]
+    assert [each.name for each in run.groups] == ["back", "front", "shelf"]
     before, keys = balls(data, nominal)
     after, of_nominal, of_found = balls(data, found)[0], means(data, nominal), means(data, found)
-    for each in run.groups.errors:
+    for each in run.groups:
         inside = np.char.startswith(keys, each.name + "/")
         fitted = {k: np.array([found[f"balls.{k}.{a}"] for a in "xyz"]) for k in np.unique(keys[inside])}
         sockets = of_found if each.name == "shelf" else fitted
@@ -113,7 +113,7 @@ def test_errors_of_each_position_are_distances_to_its_sockets(run, data):
 def test_known_distances_are_judged_by_what_the_postures_say(run, data):
     """Not by what the fit made of the sockets, which a known distance pulls to itself."""
     found, nominal = co.by_name(run.estimate.parameters, run.estimate.values), co.named(LEFT, "left")
-    for each in run.groups.errors:
+    for each in run.groups:
         if each.name == "shelf":
             assert each.distance_error_mm is None
             continue
