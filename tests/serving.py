@@ -20,7 +20,7 @@ import yaml
 from armcal.calibration.calibration_file import identity_of, sealed
 from armcal_serve.answers import Answerer
 from armcal_serve.client import Client
-from armcal_serve.loading import Loader, Order
+from armcal_serve.loading import Loader
 
 ROOT = Path(__file__).resolve().parents[1]
 LONG_S = 120.0
@@ -56,7 +56,7 @@ def sha256(text: str) -> str:
 
 def made(text: str, shown: str = "c.yaml", **order: Any) -> Answerer:
     """What answers by a calibration's text, in this process."""
-    return loaded(Loader(Order(shown, **{"evaluator": "interpreted", **order})), text)
+    return loaded(Loader(shown, **{"evaluator": "interpreted", **order}), text)
 
 
 def loaded(loader: Loader, text: str) -> Answerer:

@@ -10,22 +10,20 @@ import click
 from armcal.base.config_text import as_line
 from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.measured_point import Point
-from armcal.cli.common import Console, accept, point, speaking
-from armcal.errors import InputError
+from armcal.cli.common import Console, accept, point, speaking, within
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.lines import StandardOutput
-from armcal.io.signals import Signals
 
-from armcal_serve.loading import Order
-from armcal_serve.server import Notify, Server
+from armcal_serve.loading import Loader, Notify
+from armcal_serve.server import Server
 
-_ALWAYS = ("refused", "missing", "status", "notice")  # Events that are written with --quiet too
+_ALWAYS = ("refused", "missing", "notice")  # Events that are written with --quiet too
 
 
 @click.command()
 @click.argument("calibration", type=click.Path(path_type=Path))
 @click.option("--socket", "path", type=click.Path(path_type=Path), help="Answer at this Unix socket.")
-@click.option("--within", type=click.Path(path_type=Path), help="A configuration whose plan has limits and clearance.")
+@within
 @click.option(
     "--redundancy",
     type=click.Choice(get_args(Redundancy)),
@@ -57,24 +55,8 @@ def serve(
 
     By default they come by standard input and answers go to standard output. The file may be replaced at any time.
     """
-    if path is None and (sys.__stdin__ is None or sys.__stdout__ is None):
-        text = "standard input or output is closed, expected requests by the one and a reader of the other."
-        raise InputError(text, hint="Open both, or give --socket.")
-    streams = None
-    if path is None:
-        assert sys.__stdin__ is not None and sys.__stdout__ is not None
-        streams = sys.__stdin__.fileno(), sys.__stdout__.fileno()
-    order = Order(
-        str(calibration),
-        redundancy=redundancy,
-        within=str(within or ""),
-        point=point or "tool",
-        evaluator=evaluator,
-        accept=accept,
-    )
-    server = Server(order, _notifier(console), path, streams)
-    with Signals() as signals:
-        server.run(signals)
+    loader = Loader(str(calibration), redundancy, str(within or ""), point or "tool", evaluator, accept)
+    Server(loader, _notifier(console)).run(path)
 
 
 def _notifier(console: Console) -> Notify:

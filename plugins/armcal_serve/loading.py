@@ -6,12 +6,11 @@ was compiled at the start. So a replaced file costs a fifth of a second of readi
 
 import hashlib
 import json
-import re
 import sys
 import threading
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -34,18 +33,17 @@ if TYPE_CHECKING:
     from armcal.run.plan_poses import Workspace
 
 LOOK_S = 0.2  # How often the file is looked at
-_TRIES = 5  # Requests of each kind before the first real one: caches are filled by them
 _ORDINARY_C = 20.0
 _WORK_S, _REST_S = 0.001, 0.0015
-_LAST_LINE = re.compile(rb"^# sha256 of the lines above: [0-9a-f]{64}\r?\n\Z", re.MULTILINE)
-"""What a calibration ends in; the hash in it is checked when it is loaded."""
 
 State = Literal["taken", "loading", "refused", "missing"]
+Notify = Callable[[str, str, Mapping[str, Any]], None]
+"""Takes an event's name, a sentence and its fields, for the program that started the server."""
 
 
-@dataclass(frozen=True)
-class Order:
-    """How a calibration is to be served.
+@dataclass
+class Loader:
+    """Makes answerers of one arm's calibrations, each of which takes over what was compiled for the one before.
 
     Attributes:
         accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
@@ -58,45 +56,35 @@ class Order:
     point: Point = "tool"  # what forward and compensate are about: the tool's frame, or the target that was measured
     evaluator: EvaluatorChoice = "compiled"  # ``compiled`` where a compiler is found, or ``interpreted``
     accept: bool = False
-
-
-@dataclass
-class Loader:
-    """Makes answerers of one arm's calibrations, each of which takes over what was compiled for the one before."""
-
-    order: Order
-    sequence: int = 0  # of the calibration that was loaded last
-    _arms: Mapping[str, Any] = field(default_factory=dict)  # its arms, as it describes them
-    _spaces: dict[str, "Workspace"] = field(default_factory=dict)  # by arm, where there are limits
-    _last: Mapping[str, ServedArm] = field(default_factory=dict)  # by name
+    sequence: int = field(init=False, default=0)  # of the calibration that was loaded last
+    _arms: Mapping[str, Any] = field(init=False, default_factory=dict)  # its arms, as it describes them
+    _spaces: dict[str, "Workspace"] = field(init=False, default_factory=dict)  # by arm, where there are limits
+    _last: Mapping[str, ServedArm] = field(init=False, default_factory=dict)  # by name
 
     def load(self, data: bytes) -> tuple[Answerer, list[str]]:
         """The answerer of a calibration's bytes, and what its users should know of it."""
-        order, sequence = self.order, self.sequence + 1
-        require_whole(data, order.shown)
+        sequence = self.sequence + 1
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", CalibrationWarning)
-            calibration = Calibration.load(order.shown, accept=order.accept or sequence > 1, content=data)
+            calibration = Calibration.load(self.shown, accept=self.accept or sequence > 1, content=data)
         record = calibration.record
         if self._arms and record.arms != self._arms:
             hint = "Put a calibration of the same arm there, or start a server of its own for this one."
-            raise ConfigError("it is of another arm.", where=Location(order.shown), hint=hint)
-        recalibrated = (record.recalibrated or {}).get("sequence")
+            raise ConfigError("it is of another arm.", where=Location(self.shown), hint=hint)
         tag = {
             "sequence": sequence,  # 1 for the one that the server began with, one more for each later one
             "created": record.created,
             "sha256": hashlib.sha256(data).hexdigest(),
             "arm": record.identity.get("arm", ""),
-            "recalibrated": recalibrated if isinstance(recalibrated, int) else None,
+            "recalibrated": (record.recalibrated or {}).get("sequence"),
             "level": record.level,
         }
         answerer = Answerer({name: self._served(calibration, name) for name in calibration.system.arms}, tag)
-        for _ in range(1 if self._last else _TRIES):
-            warm_up(answerer)
+        warm_up(answerer)
         self.sequence, self._arms, self._last = sequence, record.arms, answerer.arms
-        if record.level == "lost" and not order.accept:
-            answerer = Answerer(answerer.arms, tag, lost_calibration(record, order.shown))
+        if record.level == "lost" and not self.accept:
+            answerer = Answerer(answerer.arms, tag, lost_calibration(record, self.shown))
         return answerer, [str(notice.message) for notice in caught]
 
     def _served(self, calibration: Calibration, name: str) -> ServedArm:
@@ -105,7 +93,7 @@ class Loader:
         if unserved:
             raise ConfigError(
                 f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
-                where=Location(self.order.shown),
+                where=Location(self.shown),
                 hint="Use armcal predict or armcal compensate, which read it from a column.",
             )
         heated = None
@@ -123,7 +111,7 @@ class Loader:
             self._compensator(calibration, name, (), before.compensator if before else None),
             needs_payload,
             heated,
-            self.order.point,
+            self.point,
             recorded,
         )
 
@@ -131,22 +119,21 @@ class Loader:
         self, calibration: Calibration, name: str, conditions: tuple[str, ...], before: Compensator | None
     ) -> Compensator:
         """Made of what was compiled for the calibration before, where it can be."""
-        order = self.order
-        if order.within and name not in self._spaces:
+        if self.within and name not in self._spaces:
             from armcal.plugins import discover  # late: not needed without limits
             from armcal.run.plan_poses import workspace_of
 
             joints = tuple(calibration.system.arms[name].commanded)
-            self._spaces[name] = workspace_of(Path(order.within), joints, discover())
+            self._spaces[name] = workspace_of(Path(self.within), joints, discover())
         space = self._spaces.get(name)
         limits, allowed = (space.limits, space.allowed) if space else ({}, None)
-        options, like = Options(limits=limits, redundancy=order.redundancy), before.expression if before else None
-        expression = calibration.expression(name, conditions, order.point, calibration.free, like)
+        options, like = Options(limits=limits, redundancy=self.redundancy), before.expression if before else None
+        expression = calibration.expression(name, conditions, self.point, calibration.free, like)
         try:
-            return Compensator(expression, calibration.parameters, options, allowed, order.evaluator)
+            return Compensator(expression, calibration.parameters, options, allowed, self.evaluator)
         except ValueError as fault:
             hint = "Correct the limits in the plan."
-            raise ConfigError(f"{fault}.", where=Location(order.within or order.shown), hint=hint) from fault
+            raise ConfigError(f"{fault}.", where=Location(self.within or self.shown), hint=hint) from fault
 
 
 def warm_up(answerer: Answerer) -> None:
@@ -171,13 +158,6 @@ def _answer(answerer: Answerer, request: Mapping[str, Any]) -> dict[str, Any]:
     return dict(json.loads(answer or b"{}"))
 
 
-def require_whole(data: bytes, shown: str) -> None:
-    """Refuse what cannot be a whole calibration."""
-    if not _LAST_LINE.search(data):
-        text = f"found {len(data)} bytes that do not end with the line that ends a calibration: this is no whole one."
-        raise ConfigError(text, where=Location(shown), hint="Take a whole copy, or run the calibration again.")
-
-
 class _Breaks:
     """Makes a thread rest for longer than it works, so that it hardly delays the one that answers."""
 
@@ -196,16 +176,14 @@ class CalibrationFile:
     Attributes:
         state, why: of what is there now, and a sentence about it where it is not taken.
         served: the answerer of the last one that could be loaded; None before the first.
-        news: events for the program that started the server: name, sentence and fields.
     """
 
-    def __init__(self, loader: Loader) -> None:
-        self.path = Path(loader.order.shown)
+    def __init__(self, loader: Loader, notify: Notify) -> None:
+        self.path = Path(loader.shown)
         self.state: State = "loading"
         self.why = ""
         self.served: Answerer | None = None
-        self.news: list[tuple[str, str, Mapping[str, Any]]] = []
-        self._loader = loader
+        self._loader, self._notify = loader, notify
         self._tried: tuple[int, ...] | None = None
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._follow, name="armcal-load", daemon=True)
@@ -224,45 +202,49 @@ class CalibrationFile:
             status = self.path.stat()
         except OSError:
             self._tried = None
-            why = "there is no such file; the calibration before is used on."
-            self._set("missing", why, f"{self.path}: {why}")
+            self._not_taken("missing", f"{self.path}: there is no such file; the calibration before is used on.")
             return
         key = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
         if key != self._tried:
             self._tried = key
-            fault = self.take()
-            if fault is not None:
-                self._set("refused", str(fault), f"the new calibration is not taken: {fault}")
+            try:
+                self.load()
+            except ArmcalError as fault:
+                self._not_taken("refused", str(fault))
 
-    def take(self) -> ArmcalError | None:
-        """Load the file, if its bytes are not those that are served; what is wrong with it."""
+    def load(self) -> None:
+        """Load the file, if its bytes are not those that are served.
+
+        Raises:
+            ArmcalError: it cannot be used.
+        """
         before = self.served
-        try:
-            with input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError) as file:
-                data = file.read(MAX_BYTES)
-            if before is None or hashlib.sha256(data).hexdigest() != before.tag["sha256"]:
-                self.state, self.why = "loading", ""
+        with input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError) as file:
+            data = file.read(MAX_BYTES)
+        if before is None or hashlib.sha256(data).hexdigest() != before.tag["sha256"]:
+            self.state, self.why = "loading", ""
+            try:
                 self.served, notices = self._loader.load(data)
-                self.news += [("notice", notice, {}) for notice in notices]
-        except ArmcalError as fault:
-            return fault
-        except Exception as fault:
-            text = f"it cannot be used ({type(fault).__name__}: {fault})."
-            return ArmcalError(text, where=Location(str(self.path)), hint="Report it with the file.")
+            except ArmcalError:
+                raise
+            except Exception as fault:
+                text = f"it cannot be used ({type(fault).__name__}: {fault})."
+                raise ArmcalError(text, where=Location(str(self.path)), hint="Report it with the file.") from fault
+            for notice in notices:
+                self._notify("notice", notice, {})
+            if before is not None:
+                tag = self.served.tag
+                level = f", level {tag['level']}" if tag["level"] else ""
+                sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
+                self._notify("calibration", sentence, {"calibration": tag})
         self.state, self.why = "taken", ""
-        if before is not None and self.served is not None and self.served is not before:
-            tag = self.served.tag
-            level = f", level {tag['level']}" if tag["level"] else ""
-            sentence = f"calibration {tag['sequence']} is answered from, of {tag['created']}{level}"
-            self.news.append(("calibration", sentence, {"calibration": tag}))
-        return None
 
     def _follow(self) -> None:
-        sys.setprofile(_Breaks())  # of this thread: called with every call
+        sys.settrace(_Breaks())  # of this thread: called where a function begins
         while not self._ends.wait(LOOK_S):
             self.look()
 
-    def _set(self, state: State, why: str, sentence: str) -> None:
+    def _not_taken(self, state: State, why: str) -> None:
         if (state, why) != (self.state, self.why):
-            self.news.append((state, sentence, {"why": why}))
+            self._notify(state, f"the new calibration is {state}: {why}", {"why": why})
         self.state, self.why = state, why

@@ -1,8 +1,7 @@
 """An arm that requests are about: its joints by name, in their units, the loads on it, and where it is to go."""
 
-import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
@@ -18,7 +17,7 @@ from armcal.calibration.measured_point import Point
 from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import DataError, Location
 
-from armcal_serve.protocol import CompensateRequest, Loads, TargetRequest
+from armcal_serve.protocol import ArmRequest, CompensateRequest, TargetRequest
 
 TEMPERATURE = "temperature"
 TEMPERATURE_KEY = "temperature_C"
@@ -52,26 +51,24 @@ class ServedArm:
 
     def posture(self, values: Sequence[float] | Mapping[str, float], field: str) -> list[float]:
         """Commands (n; rad, or m) from angles in order (rad), or from values by name with the unit (``q1_deg``)."""
+        example = ", ".join(f"{name}_{'deg' if kind == 'angle' else 'mm'}" for name, kind in self.dimensions.items())
         if not isinstance(values, Mapping):
             if self.slides:
-                _refuse("the arm has prismatic joints.", field, f"Give joints by name, as {self._example}.")
+                _refuse("the arm has prismatic joints.", field, f"Give joints by name: {example}.")
             return self._in_order(values, field)
         posture: dict[str, float] = {}
         for key, value in values.items():
-            split = split_suffix(key)
-            if split is None:
-                _refuse(f"found {_short(key)!r} without a unit.", field, f"For example {self._example}.")
-            name, unit = split
-            self._known(name, field)
-            if unit.dimension != self.dimensions[name]:
-                text = f"found {unit.name} for the joint {name}, expected a unit of {self.dimensions[name]}."
-                _refuse(text, field, f"For example {self._example}.")
+            name, unit = split_suffix(key) or (key, None)
+            self._require_joints([name], field)
+            if unit is None or unit.dimension != self.dimensions[name]:
+                text = f"found {key}, expected a unit of {self.dimensions[name]}."
+                _refuse(text, field, f"Give {example}.")
             if name in posture:
                 _refuse(f"the joint {name} is given twice.", field, "Give it once.")
             posture[name] = from_unit(value, unit.name)
         missing = [name for name in self.joints if name not in posture]
         if missing:
-            _refuse(f"found no {', '.join(missing)}.", field, f"Give all of {', '.join(self.joints)}.")
+            _refuse(f"found no {', '.join(missing)}.", field, f"Give {example}.")
         return [posture[name] for name in self.joints]
 
     def written(self, values: Sequence[float], angle_unit: str) -> dict[str, float]:
@@ -80,52 +77,40 @@ class ServedArm:
         named = zip(self.dimensions.items(), values, strict=True)
         return {f"{name}_{units[kind]}": to_unit(float(value), units[kind]) for (name, kind), value in named}
 
-    def approach(self, stated: Loads, count: int) -> Array:
-        """From where each joint comes (n x count): -1, 0 (not known) or 1."""
-        sides = stated.approach
+    def approach(self, request: ArmRequest) -> Array:
+        """From where each joint comes (n x 1): -1, 0 (not known) or 1."""
+        sides = request.approach
         if isinstance(sides, Mapping):
-            for name in sides:
-                self._known(name, "approach")
+            self._require_joints(sides, "approach")
             sides = tuple(sides.get(name, 0) for name in self.joints)
-        row = np.zeros(len(self.joints)) if sides is None else np.array(self._in_order(sides, "approach"))
-        return np.repeat(row[:, None], count, axis=1)
+        return np.zeros((len(self.joints), 1)) if sides is None else np.array([self._in_order(sides, "approach")]).T
 
-    def loads(self, general: Loads, count: int, single: Sequence[Loads] = ()) -> Array:
-        """The loads (LOAD_CHANNELS x count; SI): as stated for all, then as stated for each."""
+    def loads(self, request: ArmRequest) -> Array:
+        """The loads on the arm (LOAD_CHANNELS x 1; SI)."""
         expression = self.compensator.expression
         start = expression.channels.index(LOAD_CHANNELS[0])
-        loads = np.repeat(
-            np.asarray(expression.defaults[start : start + len(LOAD_CHANNELS), None], float), count, axis=1
-        )
-        for columns, stated in ((slice(None), general), *((slice(i, i + 1), one) for i, one in enumerate(single))):
-            if stated.payload is not None:
-                loads[LOAD_CHANNELS.index(PAYLOAD), columns] = stated.payload
-            for field, channel in _VECTORS.items():
-                vector, first = getattr(stated, field), LOAD_CHANNELS.index(channel)
-                if vector is not None:
-                    loads[first : first + 3, columns] = np.array(vector)[:, None]
-        known = general.payload is not None or (single and all(stated.payload is not None for stated in single))
-        if self.needs_payload and not known:
+        loads = np.array(expression.defaults[start : start + len(LOAD_CHANNELS), None], float)
+        if request.payload is not None:
+            loads[LOAD_CHANNELS.index(PAYLOAD)] = request.payload
+        elif self.needs_payload:
             text = "what hangs on the arm moves it, and neither the request nor the calibration states its payload."
             _refuse(text, "payload_g", "Give payload_g, 0 where nothing hangs on it.")
+        for field, channel in _VECTORS.items():
+            vector, first = getattr(request, field), LOAD_CHANNELS.index(channel)
+            if vector is not None:
+                loads[first : first + 3, 0] = vector
         return loads
 
-    def targets(self, request: CompensateRequest, first: int) -> Targets:
-        """Those of a request; ``first`` is the place of its first one, for messages."""
-        some, rotations = request.targets, None
-        if some[0].rpy is not None or some[0].quaternion_wxyz is not None:
-            rotations = np.array([_rotation(target, f"targets.{first + i}") for i, target in enumerate(some)])
-        approach = self.approach(request, len(some))
-        for i, target in enumerate(some):
-            if target.approach is not None:
-                approach[:, i : i + 1] = self.approach(target, 1)
-        loads = self.loads(request, len(some), some)
-        temperatures = [request.temperature if target.temperature is None else target.temperature for target in some]
-        field = f"targets.{first + next((i for i, t in enumerate(some) if t.temperature is not None), 0)}."
-        field = TEMPERATURE_KEY if request.temperature is not None else field + TEMPERATURE_KEY
-        conditions = self.conditions(temperatures[0], field)
-        if conditions:
-            conditions = {TEMPERATURE: np.array(temperatures, dtype=float)}
+    def targets(self, request: CompensateRequest, turned: bool, place: int) -> Targets:
+        """Those of a request, or some of them from a place on; with a rotation each, or with none."""
+        some, count = request.targets, len(request.targets)
+        for i, target in enumerate(some, place):
+            if target.has_rotation is not turned:
+                text = "found some targets with a rotation and some without, expected all of one kind."
+                _refuse(text, f"targets.{i}", "Ask for them in two requests.")
+        rotations = np.array([_rotation(t, f"targets.{i}") for i, t in enumerate(some, place)]) if turned else None
+        loads, approach = (np.repeat(of(request), count, axis=1) for of in (self.loads, self.approach))
+        conditions = {name: np.full(count, value) for name, value in self.conditions(request).items()}
         try:
             return Targets(np.array([target.position for target in some]), rotations, loads, approach, conditions)
         except ValueError as fault:
@@ -133,28 +118,25 @@ class ServedArm:
             reach = f"; this arm reaches {farthest:.0f} mm from its mount at most" if math.isfinite(farthest) else ""
             _refuse(f"{fault}.", "targets", f"Give places of the base frame in mm (position_mm){reach}.")
 
-    def conditions(self, temperature: float | None, field: str) -> dict[str, Any]:
-        """What a compensator takes of the surroundings, by the temperature that a field states."""
-        if temperature is None:
+    def conditions(self, request: ArmRequest) -> dict[str, float]:
+        """What a compensator takes of the surroundings."""
+        if request.temperature is None:
             return {}
         if self.heated is None:
             hint = "Leave it out, or calibrate the arm with an effect that depends on it, such as thermal_length."
-            _refuse(f"the arm {self.name} does not change with the temperature.", field, hint)
-        return {TEMPERATURE: temperature}
+            _refuse(f"the arm {self.name} does not change with the temperature.", TEMPERATURE_KEY, hint)
+        return {TEMPERATURE: request.temperature}
 
     def under(self, conditions: Mapping[str, Any]) -> Compensator:
         return self.heated if conditions and self.heated is not None else self.compensator
 
     def beyond_records(self, commands: Array, loads: Array) -> tuple[list[int] | None, str]:
-        """Which poses lie beyond the records, and a sentence about them; None where the records' ranges are not known.
-
-        Args:
-            commands: N x n; rad or m.
-            loads: LOAD_CHANNELS x N; SI.
+        """Which commands (N x n; rad or m) lie beyond the records under loads (LOAD_CHANNELS x 1), and a sentence about
+        them; None where the records' ranges are not known.
         """
         if self.recorded is None:
             return None, ""
-        values = np.vstack([commands.T, loads[LOAD_CHANNELS.index(PAYLOAD)]])
+        values = np.vstack([commands.T, np.full(len(commands), loads[LOAD_CHANNELS.index(PAYLOAD)])])
         places: list[int] = np.flatnonzero(self.recorded.beyond(values).any(axis=0)).tolist()
         return places, self.recorded.sentence(values) if places else ""
 
@@ -164,17 +146,11 @@ class ServedArm:
             _refuse(text, field, "Give one for each joint, in this order, or give them by name.")
         return [float(value) for value in row]
 
-    def _known(self, name: str, field: str) -> None:
-        if name in self.dimensions:
-            return
-        near = difflib.get_close_matches(name, self.joints, n=1)
-        hint = f"Did you mean {near[0]}?" if near else f"The joints are {', '.join(self.joints)}."
-        _refuse(f"the arm {self.name} has no joint {_short(name)!r}.", field, hint)
-
-    @property
-    def _example(self) -> str:
-        name, kind = next(iter(self.dimensions.items()))
-        return f"{name}_{'deg' if kind == 'angle' else 'mm'}"
+    def _require_joints(self, names: Iterable[str], field: str) -> None:
+        for name in names:
+            if name not in self.dimensions:
+                text = f"the arm {self.name} has no joint {name!r:.40}."
+                _refuse(text, field, f"Its joints are {', '.join(self.joints)}.")
 
 
 def _rotation(target: TargetRequest, field: str) -> Array:
@@ -188,7 +164,3 @@ def _rotation(target: TargetRequest, field: str) -> Array:
 
 def _refuse(message: str, field: str, hint: str) -> NoReturn:
     raise DataError(message, where=Location(field=field), hint=hint)
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= 40 else f"{text[:37]}..."

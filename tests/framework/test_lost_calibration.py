@@ -9,7 +9,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal_online.tracking.start import calibration_text
-from armcal_serve.loading import Loader, Order
+from armcal_serve.loading import Loader
 from click.testing import CliRunner, Result
 from online_arm import CONFIG, begun, calibration, settings
 from serving import ask, loaded, made
@@ -80,7 +80,7 @@ def test_a_server_answers_with_the_level_and_with_an_error_once_it_is_lost(
 ) -> None:
     """That the file before is no longer used either: its arm is the one that moved."""
     request = {"do": "forward", "joint_angles_deg": [0, 0, 0, 0, 0, 0]}
-    loader = Loader(Order("c.yaml", evaluator="interpreted"))
+    loader = Loader("c.yaml", evaluator="interpreted")
     answer = ask(loaded(loader, texts["suspect"]), **request)
     assert answer["ok"] and answer["calibration"]["level"] == "suspect"
     with pytest.raises(ConfigError, match="its level is lost, as of record 17"):

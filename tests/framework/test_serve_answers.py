@@ -21,8 +21,8 @@ from armcal.calibration.compensation.request import Commands
 from armcal.calibration.recorded_range import beyond_records
 from armcal.errors import ConfigError, DataError
 from armcal_serve.answers import Answerer, command_rows
-from armcal_serve.loading import Loader, Order, require_whole
-from armcal_serve.protocol import Loads
+from armcal_serve.loading import Loader
+from armcal_serve.protocol import ArmRequest
 from armcal_serve.served_arm import ServedArm
 from scipy.spatial.transform import Rotation
 from serving import ROOT, answered, ask, described, foreign, loaded, made, sha256, told, variant
@@ -112,8 +112,6 @@ def test_commands_bring_the_calibrated_arm_there(answerer: Answerer, calibration
         found.append(command["joint_angles_deg"])
     assert found[0] == pytest.approx(Q_DEG, abs=1e-5)
     assert found[1] == pytest.approx(Q_DEG, abs=1e-5)
-    alone = told(answerer, do="compensate", targets=target | LOAD, start_deg=start)
-    assert np.rad2deg(alone["commands"][0]["joint_angles_rad"]) == pytest.approx(found[1], abs=1e-6)
 
 
 def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer, calibration: Calibration) -> None:
@@ -131,29 +129,30 @@ def test_a_path_is_followed_and_what_is_out_of_reach_is_told(answerer: Answerer,
 @pytest.mark.parametrize(
     ("request_", "where", "says"),
     [
-        ({"do": "forwards"}, "do", "Did you mean forward?"),
+        ({"do": "forwards"}, "do", "expected one of forward, compensate, status"),
         ({}, "do", "found nothing"),
-        ({"do": "forward"}, "joint_angles_deg", "neither"),
-        ({"do": "forward", "joint_angles_deg": Q_DEG, "joints": {"q1_deg": 1}}, "joint_angles_deg", "and joints"),
+        ({"do": "forward"}, "joint_angles_deg", "either joint_angles_deg or joints"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "joints": [{"q1_deg": 1}]}, "joints", "either joint_angles_deg"),
         ({"do": "forward", "joint_angles_deg": Q_DEG[:5]}, "joint_angles.0", "expected 6: q1, q2"),
         ({"do": "forward", "joint_angles": Q_DEG}, "joint_angles", "unit missing"),
         ({"do": "forward", "joint_angels_deg": Q_DEG}, "joint_angels_deg", "did you mean joint_angles_deg?"),
         ({"do": "forward", "joint_angles_deg": {"q1": 1}}, "joint_angles_deg", "expected a list"),
         ({"do": "forward", "joints": {"q1_deg": 1}}, "joints.0", "found no q2"),
-        ({"do": "forward", "joints": {"q11_deg": 1}}, "joints.0", "Did you mean q1?"),
-        ({"do": "forward", "joints": {"q1": 1}}, "joints.0", "without a unit"),
+        ({"do": "forward", "joints": {"q11_deg": 1}}, "joints.0", "joints are q1, q2"),
+        ({"do": "forward", "joints": {"q1": 1}}, "joints.0", "expected a unit of angle"),
         ({"do": "forward", "joints": {"q1_mm": 1}}, "joints.0", "expected a unit of angle"),
         ({"do": "forward", "joints": {"q1_deg": 1, "q1_rad": 1}}, "joints.0", "twice"),
         ({"do": "forward", "joint_angles_deg": []}, "joint_angles", "1 to 1000"),
         ({"do": "forward", "joint_angles_deg": [Q_DEG] * 1001}, "joint_angles", "1 to 1000"),
         ({"do": "forward", "joint_angles_deg": [1, 2, 3, 4, 5, True]}, "joint_angles", "number"),
         ({"do": "forward", "joint_angles_deg": Q_DEG, "payload_g": -1}, "payload_g", "greater than or equal"),
-        ({"do": "forward", "joint_angles_deg": Q_DEG, "arm": "left"}, "arm", "no such arm"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "arm": "left"}, "arm", "no arm 'left'"),
         ({"do": "forward", "joint_angles_deg": Q_DEG, "approach": [2] * 6}, "approach.0", "less than or equal"),
-        ({"do": "forward", "joint_angles_deg": Q_DEG, "armcal_serve": 2}, "armcal_serve", "version 2, expected 1"),
+        ({"do": "forward", "joint_angles_deg": Q_DEG, "armcal_serve": 2}, "armcal_serve", "found 2, expected 1"),
         ({"do": "compensate", "targets": [{"position_mm": [1, 2]}]}, "targets.0.position_mm", "at least 3"),
         ({"do": "compensate", "targets": [{"rpy_deg": [1, 2, 3]}]}, "targets.0", "position_mm"),
-        ({"do": "compensate", "targets": {"position_mm": [1, 2, 3], "paylod_g": 1}}, "targets", "payload_g?"),
+        ({"do": "compensate", "targets": {"position_mm": [1, 2, 3], "rpi_deg": 1}}, "targets", "rpy_deg?"),
+        ({"do": "compensate", "targets": HERE, "start_deg": [1], "start_joints": {"q1_deg": 1}}, "", "one of them"),
         ({"do": "compensate", "targets": HERE | {"quaternion_wxyz": [1, 1, 0, 0]}}, "targets.0", "length"),
         ({"do": "compensate", "targets": [HERE, HERE | {"rpy_deg": [0, 0, 0]}]}, "targets.1", "all of one kind"),
         ({"do": "compensate", "targets": HERE, "units": "counts"}, "units", "no pulse tables"),
@@ -278,15 +277,14 @@ def test_no_range_is_no_promise(answerer: Answerer) -> None:
 def test_an_elastic_arm_whose_payload_nobody_states_asks_for_it(answerer: Answerer) -> None:
     arm = replace(answerer.arms["arm"], needs_payload=True)
     with pytest.raises(DataError, match="states its payload"):
-        arm.loads(Loads(), 2)
-    assert arm.loads(Loads.si(payload=0.1), 2).shape == (13, 2)
-    assert arm.loads(Loads(), 1, [Loads.si(payload=0.1)])[3, 0] == 0.1
+        arm.loads(ArmRequest(do="forward"))
+    assert arm.loads(ArmRequest.si(do="forward", payload=0.1))[3, 0] == 0.1
 
 
 @pytest.mark.slow
 def test_only_a_whole_calibration_of_the_same_arm_is_made_ready(path: Path, answerer: Answerer) -> None:
     text = path.read_text()
-    loader = Loader(Order("c.yaml", evaluator="interpreted"))
+    loader = Loader("c.yaml", evaluator="interpreted")
     loaded(loader, text)
     moved = loaded(loader, variant(text, 1))
     assert moved.tag["sequence"] == 2
@@ -297,9 +295,9 @@ def test_only_a_whole_calibration_of_the_same_arm_is_made_ready(path: Path, answ
         (foreign(text), "another arm"),
         (sealed({**yaml.safe_load(text), "converged": False}), "did not converge"),
         (text.replace("converged: true", "converged: false"), "edited or damaged"),
-        ("armcal_calibration: 1\n", r"c\.yaml: found \d+ bytes"),
-        ("\x00\n", r"c\.yaml: found \d+ bytes"),
-        (text[: len(text) // 2].rpartition("\n")[0] + "\n", r"c\.yaml: found \d+ bytes"),
+        ("armcal_calibration: 1\n", "it was cut"),
+        ("\x00\n", r"c\.yaml"),
+        (text.rpartition("\n#")[0] + "\n", "does not end in the hash of its content: it was cut"),
     ):
         with pytest.raises(ConfigError, match=why) as caught:
             loaded(loader, wrong)
@@ -321,12 +319,13 @@ def test_commands_stay_within_what_a_configuration_allows(path: Path) -> None:
         made(text, within=str(folder / "demo.yaml"))
 
 
+@pytest.mark.slow
 def test_no_beginning_of_a_calibration_is_taken_for_one(path: Path) -> None:
-    """However a writer is interrupted: its last line is looked for, and all that is needed stands before it."""
-    lines = path.read_text().splitlines(keepends=True)
+    """However a writer is interrupted."""
+    lines, loader = path.read_text().splitlines(keepends=True), Loader("c.yaml", evaluator="interpreted")
     for end in random.Random(3).sample(range(len(lines)), 60):
-        with pytest.raises(ConfigError, match="no whole one"):
-            require_whole("".join(lines[:end]).encode(), "c.yaml")
+        with pytest.raises(ConfigError):
+            loader.load("".join(lines[:end]).encode())
 
 
 @pytest.mark.slow
@@ -334,7 +333,7 @@ def test_no_beginning_of_a_calibration_is_taken_for_one(path: Path) -> None:
 def test_a_calibration_that_takes_the_place_of_another_answers_by_its_own_numbers(path: Path, point: str) -> None:
     """Nothing is made anew but its numbers; where it frees another parameter, all of it is."""
     text = path.read_text()
-    loader = Loader(Order("c.yaml", evaluator="interpreted", point=point))  # type: ignore[arg-type]
+    loader = Loader("c.yaml", evaluator="interpreted", point=point)  # type: ignore[arg-type]
     first = loaded(loader, text)
     content = yaml.safe_load(variant(text, 2))
     fixed = next(entry for entry in content["parameters"] if not entry["free"] and entry["name"] == "arm.mdh.d2")
@@ -359,7 +358,7 @@ def test_other_statics_are_taken_with_the_calibration(path: Path) -> None:
     text = path.read_text()
     content = yaml.safe_load(text)
     content["statics"]["payload_kg"] = 0.4
-    heavy, loader = described(content), Loader(Order("c.yaml", evaluator="interpreted"))
+    heavy, loader = described(content), Loader("c.yaml", evaluator="interpreted")
     first = loaded(loader, text)
     found, expected = loaded(loader, heavy), made(heavy)
     assert found.arms["arm"].compensator.expression.record is first.arms["arm"].compensator.expression.record
@@ -384,9 +383,9 @@ def test_many_targets_are_answered_as_each_alone_a_slice_at_a_time(answerer: Ans
             for i in (0, 50, 99):
                 alone = told(answerer, do="compensate", targets=tools[i], start_deg=Q_DEG)["commands"][0]
                 assert commands[i]["joint_angles_rad"] == pytest.approx(alone["joint_angles_rad"], abs=1e-6)
-    tools[77]["paylod_g"] = 1
+    tools[77]["rpi_deg"] = 1
     answer = ask(answerer, do="compensate", targets=tools)
-    assert "payload_g?" in answer["error"] and answer["where"].startswith("targets.77")
+    assert "rpy_deg?" in answer["error"] and answer["where"].startswith("targets.77")
 
 
 def test_a_request_that_raises_is_answered(answerer: Answerer, monkeypatch: pytest.MonkeyPatch) -> None:

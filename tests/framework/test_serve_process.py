@@ -124,7 +124,9 @@ def test_calibrations_are_replaced_under_load_and_only_whole_ones(
                 file.write(half[at : at + len(half) // 4])
                 file.flush()
                 time.sleep(0.3)
-            running.until(lambda status: "no whole one" in status["file"]["why"])
+            running.until(
+                lambda status: status["file"]["state"] == "refused" and "another arm" not in status["file"]["why"]
+            )
         put(path, texts[2])
         assert taken(running, texts[2])["calibration"]["sequence"] == 3
         ended(clients)
@@ -202,13 +204,13 @@ def test_nonsense_by_standard_input_is_answered_line_by_line_to_the_end(path: Pa
     assert "256 KiB" in answers[-2]["error"]
 
 
-@pytest.mark.quick("-found 0 bytes", "None-no such file", "\\xff\\xfe\\n-no whole one")
+@pytest.mark.quick("None-no such file", "\\xff\\xfe\\n-not UTF-8")
 @pytest.mark.parametrize(
     ("content", "says"),
     [
         (None, "no such file"),
-        (b"", "found 0 bytes"),
-        (b"\xff\xfe\n", "no whole one"),
+        (b"", "the file is empty"),
+        (b"\xff\xfe\n", "not UTF-8"),
         (f"{HALF}# sha256 of the lines above: {sha256(HALF)}\n".encode(), "not valid YAML"),
         (f"{HALF}# sha256 of the lines above: {sha256('other')}\n".encode(), "edited or damaged"),
     ],

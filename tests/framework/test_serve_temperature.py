@@ -67,36 +67,17 @@ def test_a_warm_arm_is_where_the_calibration_predicts_it(warm: Answerer) -> None
 
 
 @pytest.mark.parametrize("path", [False, True])
-@pytest.mark.parametrize("general", [None, 35.0])
-def test_each_target_is_had_at_its_own_temperature(warm: Answerer, general: float | None, path: bool) -> None:
-    """What a target says wins over what the request says; what nobody says is the reference."""
-    own = [None, 80.0, 0.0, None, -10.0]
+def test_targets_are_reached_at_the_temperature_of_the_request(warm: Answerer, path: bool) -> None:
     near = places_mm(POSTURES_DEG[:1])[0]
-    targets = [{"position_mm": (near + np.array([0, 2 * i, 0])).tolist()} for i in range(len(own))]
-    said = [t if c is None else t | {"temperature_C": c} for t, c in zip(targets, own, strict=True)]
-    for_all = {} if general is None else {"temperature_C": general}
-    answer = ask(warm, do="compensate", targets=said, path=path, **NEAR, **for_all)
-    if general is None:
-        assert "expected all of one kind" in answer["error"] and answer["where"] == "targets.1"
-        return
-    otherwise = REFERENCE_C if general is None else general
-    told_C = np.array([otherwise if c is None else c for c in own])
-    reached = places_mm(commanded(answer), temperature=told_C)
-    assert reached == pytest.approx(np.array([t["position_mm"] for t in targets]), abs=1e-5)
-    tools = [command["tool"]["position_mm"] for command in answer["commands"]]
-    assert np.array(tools) == pytest.approx(reached, abs=1e-5)
-
-
-def test_one_temperature_for_all_is_one_for_each(warm: Answerer) -> None:
-    targets = [{"position_mm": place.tolist()} for place in places_mm(POSTURES_DEG, temperature=50.0)]
-    for path in (False, True):
-        request = {"do": "compensate", "path": path, **NEAR}
-        for_all = commanded(told(warm, targets=targets, temperature_C=50, **request))
-        for_each = commanded(told(warm, targets=[t | {"temperature_C": 50} for t in targets], **request))
-        assert np.array_equal(for_all, for_each)
-    alone = [commanded(told(warm, do="compensate", targets=t, temperature_C=50, **NEAR))[0] for t in targets]
-    together = told(warm, do="compensate", targets=targets, temperature_C=50, **NEAR)
-    assert commanded(together) == pytest.approx(np.array(alone), abs=1e-6)
+    targets = [{"position_mm": (near + np.array([0, 2 * i, 0])).tolist()} for i in range(5)]
+    for temperature in (None, 35.0):
+        stated = {} if temperature is None else {"temperature_C": temperature}
+        answer = told(warm, do="compensate", targets=targets, path=path, **NEAR, **stated)
+        actual = REFERENCE_C if temperature is None else temperature
+        reached = places_mm(commanded(answer), temperature=np.full(5, actual))
+        assert reached == pytest.approx(np.array([t["position_mm"] for t in targets]), abs=1e-5)
+        tools = [command["tool"]["position_mm"] for command in answer["commands"]]
+        assert np.array(tools) == pytest.approx(reached, abs=1e-5)
 
 
 @pytest.mark.parametrize("temperature", [None, 60.0])
@@ -120,7 +101,7 @@ def test_the_command_line_finds_the_same(warm: Answerer, warm_path: Path, temper
 
 def test_what_is_wrong_with_a_temperature_is_said(other: Answerer, warm: Answerer) -> None:
     forward = {"do": "forward", "joint_angles_deg": POSTURES_DEG}
-    single = {"do": "compensate", "targets": [HERE, HERE | {"temperature_C": 20}]}
+    single = {"do": "compensate", "targets": [HERE, HERE]}
     for who, request, where, says in (
         (warm, forward | {"temperature": 20}, "temperature", "unit missing: write temperature_C: 20"),
         (warm, forward | {"temperature_C": -273.2}, "temperature_C", "greater than or equal to -273.15"),
@@ -133,8 +114,7 @@ def test_what_is_wrong_with_a_temperature_is_said(other: Answerer, warm: Answere
         (warm, forward | {"temperature_C": [20, 30, 40]}, "temperature_C", "expected a number"),
         (warm, forward | {"humidity_1": 0.5}, "humidity_1", "unknown key"),
         (other, forward | {"temperature_C": 20}, "temperature_C", "does not change"),
-        (other, single, "targets.1", "expected all of one kind"),
-        (other, {**single, "targets": single["targets"][1]}, "targets.0.temperature_C", "does not change"),
+        (warm, single | {"targets": HERE | {"temperature_C": 20}}, "targets.0.temperature_C", "unknown key"),
         (other, single | {"temperature_C": 20}, "temperature_C", "does not change"),
     ):
         answer = ask(who, **request)
