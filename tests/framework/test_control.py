@@ -7,14 +7,14 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal.io.json_server import MOST_CLIENTS, JsonServer, short_address
+from armcal.io.json_server import MOST_CLIENTS, JsonServer
 from armcal_online.running.control import answer, ask, control_server
 from armcal_online.running.situation import SOCKET
 from click.testing import CliRunner
@@ -95,62 +95,35 @@ def test_several_requests_in_one_go_and_one_in_pieces(tmp_path: Path) -> None:
 
 
 def test_a_request_without_an_end_is_refused_and_many_clients_do_no_harm(tmp_path: Path) -> None:
-    with serving(tmp_path):
+    with serving(tmp_path) as server:
         (told,) = raw(tmp_path, b"x" * 70_000)
         assert "64 KiB" in told["error"]
         clients: list[socket.socket] = []
         for _ in range(MOST_CLIENTS + 4):
             connection = socket.socket(socket.AF_UNIX)
-            connection.settimeout(5.0)
             connection.connect(str(tmp_path / SOCKET))
+            connection.settimeout(5.0)
             clients.append(connection)
-            clients[0].sendall(b'{"command": "status"}\n')  # it came first, and is never idle
-            assert b"status" in clients[0].recv(4096)
-        assert ask(tmp_path, {"command": "status"})["ok"]
-        with clients[1].makefile("rb") as said:  # the one that was idle for longest had to go, and is told so
-            assert "asked nothing" in json.loads(said.readline())["error"]
+        with clients[-1].makefile("rb") as said:  # one too many is told so
+            assert "64 clients are connected" in json.loads(said.readline())["error"]
             assert said.read() == b""
+        clients[0].sendall(b'{"command": "status"}\n')
+        assert b"status" in clients[0].recv(4096)
         for connection in clients:
             connection.close()
+        while server.clients:
+            time.sleep(0.01)
         assert ask(tmp_path, {"command": "status"})["ok"]
 
 
-def test_requests_that_trickle_in_shut_nobody_out_and_have_to_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with serving(tmp_path), ExitStack() as opened, short_address(tmp_path / SOCKET) as address:
-        idle = opened.enter_context(socket.socket(socket.AF_UNIX))
-        idle.connect(address)
-        slow = [opened.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(2 * MOST_CLIENTS)]
-        for one in slow:
-            one.connect(address)
-            one.send(b'{"comm')
-            time.sleep(0.002)
-        for one in slow:
-            with suppress(OSError):
-                one.send(b"a")  # those that are still there are heard of later than the idle one
-        assert ask(tmp_path, {"command": "status"}, 5.0)["ok"]
-        idle.sendall(b'{"command": "status"}\n')
-        idle.settimeout(5.0)
-        assert b'"ok": true' in idle.recv(1000)
-        monkeypatch.setattr("armcal.io.json_server.LINE_S", 0.1)
-        slow[-1].settimeout(5.0)
-        with slow[-1].makefile("rb") as said:
-            assert "no whole request came" in json.loads(said.readline())["error"]
-            assert said.read() == b""
-
-
-def test_a_client_that_asks_on_and_never_reads_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal.io.json_server.PATIENCE_S", 0.1)
+def test_a_client_that_asks_on_and_never_reads_holds_nobody_up(tmp_path: Path) -> None:
     line = json.dumps({"command": "status", "filler": "x" * 20_000}).encode() + b"\n"
     with serving(tmp_path), socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(5.0)
+        connection.settimeout(0.2)
         connection.connect(str(tmp_path / SOCKET))
-        ends = time.monotonic() + 5.0
-        with pytest.raises((BrokenPipeError, ConnectionResetError)):
-            while time.monotonic() < ends:
+        with pytest.raises(TimeoutError):  # it is not read from any more
+            for _ in range(10_000):
                 connection.sendall(line)
-                time.sleep(0.01)
         assert ask(tmp_path, {"command": "status"})["ok"]
 
 

@@ -10,7 +10,6 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -105,7 +104,6 @@ def test_a_long_request_is_answered_in_slices_while_others_have_their_turns(hous
     with connected(tmp_path) as greedy, connected(tmp_path) as modest:
         greedy.sendall(b"long\n" * 500)
         house.turn(5)
-        assert house.server.waiting == 499
         modest.sendall(b"modest\n")
         assert heard(house, modest, 1)[0]["echo"] == "modest"
         assert house.lines.count(b"long") <= 2
@@ -125,22 +123,19 @@ def test_one_client_with_many_requests_does_not_delay_another(house: House, tmp_
         assert len(heard(house, greedy, 500)) == 500
 
 
-def test_who_does_not_read_is_not_listened_to_and_then_let_go(
-    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("armcal.io.json_server.PATIENCE_S", 0.3)
+def test_who_does_not_read_is_not_listened_to(house: House, tmp_path: Path) -> None:
     house.size = 100_000
     with connected(tmp_path) as deaf, connected(tmp_path) as other:
         sent = 0
-        ends = time.monotonic() + 20
-        while house.server.clients != 1 and time.monotonic() < ends:
-            with contextlib.suppress(BlockingIOError, BrokenPipeError):
+        for _ in range(300):
+            with contextlib.suppress(BlockingIOError):
                 sent += deaf.send(b"me\n" * 1000)
             house.turn()
-        assert house.server.clients == 1 and sent < 10_000_000 and len(house.lines) < 100
+        assert sent < 10_000_000 and len(house.lines) < 100
         house.size = 0
         other.sendall(b"here\n")
         assert heard(house, other, 1)[0]["echo"] == "here"
+    house.until(lambda: house.server.clients == 0)
 
 
 @pytest.mark.slow
@@ -188,20 +183,19 @@ def test_fifty_megabytes_without_a_line_end_take_no_memory_and_delay_nobody(hous
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 16 * 1024  # KiB
 
 
-@pytest.mark.slow
-def test_where_all_are_waited_for_one_more_is_told_so(house: House, tmp_path: Path) -> None:
-    house.answering = False
-    crowd = []
-    for _ in range(MOST_CLIENTS):
-        crowd.append(connected(tmp_path))
-        send(house, crowd[-1], b"asked\n")
-        house.turn()
-    house.until(lambda: house.server.clients == MOST_CLIENTS and len(house.lines) == MOST_CLIENTS)
+def test_one_client_too_many_is_told_so(house: House, tmp_path: Path) -> None:
+    crowd = [connected(tmp_path) for _ in range(MOST_CLIENTS)]
+    house.until(lambda: house.server.clients == MOST_CLIENTS)
     with connected(tmp_path) as one_more:
-        assert "clients are connected" in heard(house, one_more, 1)[0]["error"]
+        assert "64 clients are connected" in heard(house, one_more, 1)[0]["error"]
+        house.until(lambda: one_more.recv(100) == b"")
+    crowd.pop().close()
+    house.until(lambda: house.server.clients < MOST_CLIENTS)
+    crowd.append(connected(tmp_path))
+    send(house, crowd[-1], b"now\n")
+    assert heard(house, crowd[-1], 1)[0]["echo"] == "now"
     for client in crowd:
         client.close()
-    house.answering = True
     house.until(lambda: house.server.clients == 0)
 
 
@@ -248,95 +242,3 @@ def test_standard_output_that_is_closed_ends_it() -> None:
     os.close(theirs[0])
     os.write(ours[1], b"one\n")
     house.until(lambda: house.server.ended)
-
-
-def test_idle_and_slow_clients_give_way_to_one_that_asks(
-    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All places are taken: by one that asks now and then, by one that never ends its line, and by idle ones."""
-    now = _clock(monkeypatch)
-    crowd = [connected(tmp_path) for _ in range(MOST_CLIENTS)]
-    house.until(lambda: house.server.clients == MOST_CLIENTS)
-    busy, slow, *others = crowd
-    send(house, slow, b"x")
-    house.turn(3)
-    now[0] += 2.0
-    for idle in others:
-        send(house, idle, b"once\n")
-        heard(house, idle, 1)
-    for _ in range(5):
-        now[0] += 4.0
-        send(house, slow, b"x")
-        send(house, busy, b"again\n")
-        heard(house, busy, 1)
-    for number in range(3):
-        one_more = connected(tmp_path)
-        send(house, one_more, f"new {number}\n".encode())
-        assert heard(house, one_more, 1)[0]["echo"] == f"new {number}"
-        crowd.append(one_more)
-    assert "this one asked nothing for 22 s: the connection is closed" in heard(house, slow, 1)[0]["error"]
-    house.until(lambda: house.server.clients <= MOST_CLIENTS)
-    send(house, busy, b"still\n")
-    assert heard(house, busy, 1)[0]["echo"] == "still"
-    for client in crowd:
-        client.close()
-
-
-def test_a_line_has_a_deadline_and_an_answer_that_is_awaited_has_none(
-    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = _clock(monkeypatch)
-    with connected(tmp_path) as silent, connected(tmp_path) as waiting, connected(tmp_path) as planner:
-        send(house, planner, b"asked\n")
-        heard(house, planner, 1)
-        house.answering = False
-        send(house, waiting, b"held\n")
-        house.until(lambda: house.server.clients == 3)
-        for _ in range(8):
-            now[0] += 9.0
-            house.turn()
-        assert "no whole request came within 30 s" in heard(house, silent, 1)[0]["error"]
-        house.until(lambda: house.server.clients == 2)
-        house.answering = True
-        assert heard(house, waiting, 1)[0]["echo"] == "held"
-        send(house, planner, b"half a l")
-        house.turn(3)
-        now[0] += 31.0
-        assert "no whole request" in heard(house, planner, 1)[0]["error"]
-
-
-@pytest.mark.slow
-def test_out_of_descriptors_it_neither_spins_nor_stops(house: House, tmp_path: Path) -> None:
-    with connected(tmp_path) as first, connected(tmp_path) as second:
-        house.answering = False
-        send(house, first, b"one\n")
-        send(house, second, b"two\n")
-        house.until(lambda: len(house.lines) == 2)
-        third = connected(tmp_path)
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        free = os.dup(0)
-        os.close(free)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
-        try:
-            house.turn(3)
-            house.answering = True
-            assert heard(house, first, 1)[0]["echo"] == "one" and heard(house, second, 1)[0]["echo"] == "two"
-            turns, ends = 0, time.monotonic() + 0.5
-            while time.monotonic() < ends:
-                house.server.serve(0.1)
-                turns += 1
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        assert turns < 50
-        send(house, third, b"three\n")
-        assert heard(house, third, 1)[0]["echo"] == "three"
-        third.close()
-
-
-def _clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """What the server's clock began at, in a list of one number (s)."""
-    now = [1000.0]
-    began = time.monotonic()
-    clock = SimpleNamespace(monotonic=lambda: now[0] + time.monotonic() - began)
-    monkeypatch.setattr("armcal.io.json_server.time", clock)
-    return now

@@ -7,7 +7,6 @@ they come, and who does not read its answers is not read from.
 """
 
 import contextlib
-import errno
 import json
 import os
 import selectors
@@ -29,12 +28,8 @@ from armcal.io.lines import LineCutter, write_ready
 MOST_CLIENTS = 64
 MOST_WAITING = 64  # So many of a client's requests are taken before the first is answered
 MOST_UNREAD_BYTES = 1024**2  # A client that leaves so much unread is not answered, nor listened to, until it reads
-PATIENCE_S = 10.0  # A client that leaves answers unread for so long is disconnected
-LINE_S = 30.0  # So long a client may take over its first line, and over any that it began
 SLICE_S = 0.001  # After so much work the server looks who else has come
 _CHUNK = 64 * 1024
-_PAUSE_S = 1.0  # No client is accepted for so long where the system has no descriptor and no client is idle
-_NO_MORE = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _PATH_BYTES = 100  # A longer path does not fit a Unix socket's address
 
 
@@ -126,7 +121,7 @@ class Answers(Protocol):
         """The answer to a line that came then (monotonic seconds); None before it, after each slice of work."""
 
     def refusal(self, fault: ArmcalError) -> bytes:
-        """The answer to what cannot be read, and to a client that is sent away."""
+        """The answer to what cannot be read, and to a client that is one too many."""
 
 
 class PlainAnswers(Answers):
@@ -172,8 +167,7 @@ class _Client:
         self.lines: deque[tuple[bytes | ArmcalError, float]] = deque()
         self.work: Iterator[bytes | None] | None = None
         self.out = bytearray()
-        self.reading, self.gone, self.has_asked = True, False, False
-        self.heard = self.progress = time.monotonic()  # of its last line, or the beginning of one; when it last read
+        self.reading, self.gone = True, False
 
     @property
     def due(self) -> bool:
@@ -201,7 +195,6 @@ class JsonServer:
         self._round: list[_Client] = []  # those who are ready
         self._listener: socket.socket | None = None
         self._path: Path | None = None
-        self._accepts_at = 0.0
 
     @classmethod
     def at(
@@ -215,11 +208,6 @@ class JsonServer:
     @property
     def clients(self) -> int:
         return len(self._clients)
-
-    @property
-    def waiting(self) -> int:
-        """Requests that nobody has begun to answer."""
-        return sum(len(client.lines) for client in self._clients)
 
     @property
     def ended(self) -> bool:
@@ -256,16 +244,12 @@ class JsonServer:
             listener.close()
             raise
         self._listener, self._path = listener, path
-        self._watch(listener.fileno(), self._accept)
+        self.watch(listener.fileno(), self._accept)
 
     def attach(self, incoming: int, outgoing: int) -> None:
         """Serve a pair of descriptors, which stay the caller's and are not made non-blocking: others share them."""
         receive, send = partial(os.read, incoming, _CHUNK), partial(write_ready, outgoing)
         self._begin(_Client(incoming, outgoing, receive, send, lambda: None, self._longest))
-
-    def watch(self, descriptor: int, readable: Callable[[], None]) -> None:
-        """Call this too, within ``serve``, while a descriptor can be read."""
-        self._watch(descriptor, readable)
 
     def serve(self, wait_s: float = 0.0) -> None:
         """Read, work and write once; wait so long for something to do where there is nothing."""
@@ -279,13 +263,12 @@ class JsonServer:
             clients, self._round = sorted(self._round, key=lambda client: client.work is not None), []
             for client in clients:
                 self._work(client)
-        self._tidy()
 
     def stop_reading(self) -> None:
         """Take no further requests and clients; those that came are answered."""
         if self._listener is not None:
-            self._watch(self._listener.fileno())
-        for client in self._clients:
+            self.watch(self._listener.fileno())
+        for client in [*self._clients]:
             client.reading = False
             self._arrange(client)
 
@@ -307,36 +290,17 @@ class JsonServer:
         assert self._listener is not None
         try:
             connection, _ = self._listener.accept()
-        except OSError as failed:
-            if failed.errno in _NO_MORE and not self._make_room("the system has no place for another"):
-                self._watch(self._listener.fileno())
-                self._accepts_at = time.monotonic() + _PAUSE_S
+        except OSError:
             return
         connection.setblocking(False)
-        number, why = connection.fileno(), f"{MOST_CLIENTS} clients are connected"
-        if sum(client.reading for client in self._clients) >= MOST_CLIENTS and not self._make_room(why):
-            fault = ArmcalError(f"{why}.", hint="Close connections that are not used.")
+        if len(self._clients) >= MOST_CLIENTS:
+            fault = ArmcalError(f"{MOST_CLIENTS} clients are connected.", hint="Close connections that are not used.")
             with contextlib.suppress(OSError):
                 connection.send(self._answers.refusal(fault) + b"\n")
             connection.close()
             return
-        receive = partial(connection.recv, _CHUNK)
+        number, receive = connection.fileno(), partial(connection.recv, _CHUNK)
         self._begin(_Client(number, number, receive, connection.send, connection.close, self._longest))
-
-    def _make_room(self, why: str) -> bool:
-        """Send one away that is owed nothing: with half a line first, then the one that asked the longest ago."""
-        idle = [client for client in self._clients if client.reading and not client.due]
-        if not idle:
-            return False
-        one = min(idle, key=lambda client: (not client.cutter.begun, client.heard))
-        self._send_away(one, f"{why}, and this one asked nothing for {time.monotonic() - one.heard:.0f} s")
-        return True
-
-    def _send_away(self, client: _Client, why: str) -> None:
-        hint = "Connect anew when there is a request."
-        client.lines.append((ArmcalError(f"{why}: the connection is closed.", hint=hint), time.monotonic()))
-        client.reading = False
-        self._arrange(client)
 
     def _read(self, client: _Client) -> None:
         try:
@@ -346,15 +310,11 @@ class JsonServer:
         except OSError:
             self._drop(client)
             return
-        now, had_begun = time.monotonic(), client.cutter.begun
-        lines = client.cutter.feed(data)
+        now, lines = time.monotonic(), client.cutter.feed(data)
         if not data:
             client.reading = False
-            lines = [client.cutter.rest()] if had_begun else []
-        if lines or not had_begun:
-            client.heard = now
+            lines = [client.cutter.rest()] if client.cutter.begun else []
         for line in lines:
-            client.has_asked = True
             if line is None:
                 text = f"the request has more than {self._longest // 1024} KiB."
                 client.lines.append((DataError(text, hint="Ask for less at a time."), now))
@@ -376,8 +336,6 @@ class JsonServer:
         answer = next(client.work)
         if answer is not None:
             client.work = None
-            if not client.out:
-                client.progress = time.monotonic()
             client.out += answer + b"\n"
             self._write(client)
         self._arrange(client)
@@ -390,7 +348,6 @@ class JsonServer:
                 if not sent:
                     break
                 del client.out[:sent]
-                client.progress = time.monotonic()
         except BlockingIOError:
             pass
         except OSError:
@@ -398,26 +355,12 @@ class JsonServer:
             return
         self._arrange(client)
 
-    def _tidy(self) -> None:
-        """Drop clients that are done or do not read, and send those away that do not end a line."""
-        now = time.monotonic()
-        if self._accepts_at and now >= self._accepts_at and self._listener is not None:
-            self._accepts_at = 0.0
-            self._watch(self._listener.fileno(), self._accept)
-        for client in [*self._clients]:
-            if (client.out and now - client.progress > PATIENCE_S) or not (client.reading or client.due):
-                self._drop(client)
-                continue
-            owes_line = client.reading and not client.due and (client.cutter.begun or not client.has_asked)
-            if owes_line and now - max(client.heard, client.progress) > LINE_S:
-                self._send_away(client, f"no whole request came within {LINE_S:g} s")
-
     def _drop(self, client: _Client) -> None:
         if client.gone:
             return
         client.gone, client.reading = True, False
         for place in {client.incoming, client.outgoing}:
-            self._watch(place)
+            self.watch(place)
         client.lines.clear()
         client.out.clear()
         client.work = None
@@ -425,7 +368,9 @@ class JsonServer:
         client.close()
 
     def _arrange(self, client: _Client) -> None:
-        """Put it into the round if it has something to do, and watch the descriptors that can go on."""
+        """Drop it if it is done; else put it into the round if it is ready, and watch what it waits for."""
+        if not (client.reading or client.due):
+            self._drop(client)
         if client.gone:
             return
         if client.ready and client not in self._round:
@@ -434,15 +379,15 @@ class JsonServer:
         read = partial(self._read, client) if client.reading and not full else None
         write = partial(self._write, client) if client.out else None
         if client.incoming == client.outgoing:
-            self._watch(client.incoming, read, write)
+            self.watch(client.incoming, read, write)
         else:
-            self._watch(client.incoming, read)
-            self._watch(client.outgoing, None, write)
+            self.watch(client.incoming, read)
+            self.watch(client.outgoing, None, write)
 
-    def _watch(
+    def watch(
         self, place: int, read: Callable[[], None] | None = None, write: Callable[[], None] | None = None
     ) -> None:
-        """Call these when a descriptor can be read or written.
+        """Call these, within ``serve``, while a descriptor can be read or written.
 
         With neither it is not registered at all: a peer that hung up would be reported for ever.
         """
