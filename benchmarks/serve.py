@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
-from armcal_serve.client import Client
+from armcal.io.json_server import JsonClient
 
 from benchmarks import lrm
 from benchmarks.report import Row
@@ -86,7 +86,7 @@ def measured(load: Load, socket: Path, path: Path, requests: Sequence[bytes]) ->
     context = multiprocessing.get_context("spawn")
     with context.Pool(load.clients) as pool:
         asked = pool.map_async(partial(_client, socket, load.rate_hz, requests, SECONDS), range(load.clients))
-        with Client(socket) as client:
+        with JsonClient(socket) as client:
             while load.updates and not asked.ready():
                 before = client.ask({"do": "status"})["calibration"]["sequence"]
                 replace_calibration(path)
@@ -102,7 +102,7 @@ def measured(load: Load, socket: Path, path: Path, requests: Sequence[bytes]) ->
 def _client(socket: Path, rate_hz: float | None, requests: Sequence[bytes], seconds: float, number: int) -> list[float]:
     waits = []
     at = number * len(requests) // CLIENTS
-    with Client(socket) as client:
+    with JsonClient(socket) as client:
         ends = time.perf_counter() + seconds
         due = time.perf_counter()
         while (began := time.perf_counter()) < ends:

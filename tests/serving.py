@@ -18,8 +18,8 @@ from typing import Any
 
 import yaml
 from armcal.calibration.calibration_file import identity_of, sealed
+from armcal.io.json_server import JsonClient
 from armcal_serve.answers import Answerer
-from armcal_serve.client import Client
 from armcal_serve.loading import Loader
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,7 +97,7 @@ class Running:
     said: Path
 
     def ask(self, **request: Any) -> dict[str, Any]:
-        with Client(self.socket, LONG_S) as client:
+        with JsonClient(self.socket, LONG_S) as client:
             return client.ask(request)
 
     def status(self) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""Serving a calibration to other programs: requests as JSON lines, answered by a worker that is replaced in flight."""
+"""Serving a calibration, which may be replaced at any time, to other programs: requests as JSON lines."""

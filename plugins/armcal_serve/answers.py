@@ -15,15 +15,7 @@ from armcal.calibration.compensation.request import Commands, Targets
 from armcal.errors import ArmcalError, DataError, Location
 from armcal.io.json_server import SLICE_S
 
-from armcal_serve.protocol import (
-    VERSION,
-    CompensateRequest,
-    ForwardRequest,
-    RawRequest,
-    Units,
-    parsed,
-    refusal,
-)
+from armcal_serve.protocol import VERSION, CompensateRequest, ForwardRequest, RawRequest, Units, parsed, refusal
 from armcal_serve.served_arm import ServedArm
 
 Status = Callable[[], Mapping[str, Any]]  # What a request for the status is answered

@@ -18,7 +18,7 @@ import pytest
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.functions.compiler import find_compiler
-from armcal_serve.client import Client
+from armcal.io.json_server import JsonClient
 from click.testing import CliRunner
 from serving import LONG_S, Running, command, foreign, put, serving, sha256, variant
 
@@ -49,7 +49,7 @@ class Asking(threading.Thread):
 
     def run(self) -> None:
         try:
-            with Client(self.running.socket, LONG_S) as client:
+            with JsonClient(self.running.socket, LONG_S) as client:
                 at, last = self.number, False
                 while not last:
                     last = self.ends.is_set()
@@ -160,9 +160,9 @@ def test_many_targets_and_sixty_idle_clients_hold_nobody_up(path: Path) -> None:
     with serving(path, "--evaluator", "compiled") as running, contextlib.ExitStack() as opened:
         tools = running.ask(do="forward", joint_angles_deg=np.tile(POSTURES, (25, 1)).tolist())["tools"]
         assert len(tools) == 1000
-        idle = [opened.enter_context(Client(running.socket, LONG_S)) for _ in range(60)]
+        idle = [opened.enter_context(JsonClient(running.socket, LONG_S)) for _ in range(60)]
         assert all(client.ask(request)["ok"] for client in idle)
-        asking = opened.enter_context(Client(running.socket, LONG_S))
+        asking = opened.enter_context(JsonClient(running.socket, LONG_S))
         answers: list[dict[str, Any]] = []
         many = {"do": "compensate", "targets": tools, "start_deg": POSTURES[0].tolist()}
         thread = threading.Thread(target=lambda: answers.append(running.ask(**many)))
