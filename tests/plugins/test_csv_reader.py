@@ -311,10 +311,10 @@ def test_where_no_configuration_describes_the_file_the_caller_says_what_to_do(tm
     path.write_text(content)
     reader = CsvReader(CsvSettings(path=path, columns={"x_mm": "nowhere"} if name == "unknown name" else {}))
     with pytest.raises(DataError) as caught:
-        reader.read(ReadRequest({}, {}, wanted(), layout_hint="Name columns by --columns."))
+        reader.read(ReadRequest({}, {}, wanted(), layout_hint="Name columns so."))
     hint = caught.value.hint
     assert "data section" not in hint and "configuration" not in hint
-    assert hint == ("Write decimal points: 12.5." if name == "decimal comma" else "Name columns by --columns.")
+    assert hint == ("Write decimal points: 12.5." if name == "decimal comma" else "Name columns so.")
 
 
 def test_points_among_decimal_commas_are_refused(tmp_path: Path) -> None:

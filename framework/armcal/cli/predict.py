@@ -16,7 +16,6 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.intervals import PlusMinus
 from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, spare_inputs, speaking
-from armcal.errors import InputError, Location
 from armcal.measure.checks import records_of
 from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.environment import noticed
@@ -25,7 +24,7 @@ from armcal.plugins import PluginRegistry
 from armcal.run.compensate import short_texts
 
 _MOST_NAMED = 8
-_LAYOUT = "Say what the file calls a column by --columns NAME=COLUMN, with commas between columns and decimal points."
+_LAYOUT = "Name columns so, or as the calibration's data did, with commas between them and decimal points."
 _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
@@ -40,18 +39,15 @@ _RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new"
     show_default=True,
     help="Whether the poses belong to the calibration's recording, in which the drift of parameters is known.",
 )
-@click.option("--columns", multiple=True, metavar="NAME=COLUMN", help="What the CSV calls a column: sequence=pose_id.")
 @accept
 @speaking
-def predict(
-    console: Console, calibration: Path, poses: Path, out: Path, recording: str, columns: tuple[str, ...], accept: bool
-) -> None:
+def predict(console: Console, calibration: Path, poses: Path, out: Path, recording: str, accept: bool) -> None:
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
     spare_inputs(out, calibration, poses)
     registry = console.registry()
     loaded = Calibration.load(calibration, registry, accept)
     system = loaded.system
-    commands = read_commands(registry, loaded, poses, columns)
+    commands = read_commands(registry, loaded, poses)
     _warn_of_missing(console, loaded, commands, recording)
     channels, placed = loaded.predict(commands)
     plus_minus = None
@@ -127,22 +123,13 @@ def _tool_channels(arms: Sequence[str]) -> Iterator[RequestedChannel]:
             yield RequestedChannel(own, (own, name) if len(arms) == 1 else (own,), dimension, required=False)
 
 
-def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path, columns: Sequence[str]) -> Dataset:
+def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path) -> Dataset:
     """The commands. Measured columns, if there are any, are not read: every row gets its prediction."""
     arms = loaded.system.arms
     requested = requested_channels(arms, {}, measured=False)
     reader_class = registry.find("reader", "csv").load()
     kept = loaded.record.prediction
     named = kept.columns_in(poses, requested) if kept else {}
-    for text in columns:
-        name, _, own = (part.strip() for part in text.partition("="))
-        if not (name and own):
-            raise InputError(
-                f"found {text!r}, expected NAME=COLUMN.",
-                where=Location("--columns"),
-                hint="For example --columns sequence=pose_id.",
-            )
-        named[name] = own
     reader = reader_class(reader_class.Settings(path=ConfigText(str(poses)), columns=named))
     return noticed(records_of(reader, ReadRequest(arms, {}, requested, layout_hint=_LAYOUT)))
 
