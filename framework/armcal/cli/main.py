@@ -18,14 +18,14 @@ from armcal.plugins import discover, missing_library, plugin_fault, use_plugins
 from armcal.version import JSON_SCHEMA, __version__
 
 COMMANDS = {
-    "demo": ("armcal.cli.demo:demo", "Copy a demonstration's files and calibrate its simulated arm."),
+    "demo": ("armcal.cli.new:demo", "Copy a demonstration's files and calibrate its simulated arm."),
     "new": ("armcal.cli.new:new", "Begin a robot's files, or a plugin of your own."),
     "run": ("armcal.cli.run:run", "Calibrate: load, check, fit, validate, report."),
     "check": ("armcal.cli.check:check", "Everything that can be known before solving."),
-    "checks": ("armcal.cli.checks:checks", "What each run asks of its data and its fit, and how surely."),
+    "checks": ("armcal.cli.plugins:checks", "What each run asks of its data and its fit, and how surely."),
     "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
     "study": (
-        "armcal.cli.study:study",
+        "armcal.cli.run:study",
         "Compare model variants by cross-validated error, or trained at one load each.",
     ),
     "predict": ("armcal.cli.predict:predict", "Where a calibrated arm goes for commanded joint angles."),

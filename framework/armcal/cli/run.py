@@ -1,4 +1,4 @@
-"""``armcal run``."""
+"""``armcal run`` and ``armcal study``: they reserve a folder, read a configuration, compute, write and show."""
 
 import sys
 from pathlib import Path
@@ -9,14 +9,17 @@ from armcal.cli.common import FILE, Console, command_line, data, overrides, para
 from armcal.cli.console import say
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.estimate.estimator import CHECK_THE_DATA
+from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
 from armcal.report.numbers import plural
 from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
+from armcal.report.study_document import study_document
 from armcal.run import outputs
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.run.result import RunResult
+from armcal.run.study import FILES, Study, compare, files
 
 
 @click.command()
@@ -41,7 +44,7 @@ def run(
     """Calibrate the arm that CONFIG describes: load, check, fit, validate, report."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
-    reserved = click.get_current_context().with_resource(outputs.reserved(folder))
+    kept = click.get_current_context().with_resource(outputs.reserved(folder))
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     with console.progress() as progress:
@@ -54,7 +57,7 @@ def run(
     result.seconds["total"] = watch.total()
     sections, faults = plugin_sections(result, registry)
     document = run_document(result, sections)
-    outputs.write(reserved, result, experiment, page(document), accept)
+    outputs.write(kept, result, experiment, page(document), accept)
     converged = result.estimate.verdict.converged
     faults += registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged)
     for text in faults:
@@ -85,3 +88,34 @@ def _end(result: RunResult, folder: Path, accept: bool) -> None:
             err=True,
         )
         sys.exit(EXIT_DO_NOT_USE)
+
+
+@click.command()
+@click.argument("config", type=FILE)
+@data
+@click.option("--out", type=FILE, help="Where the results go [default: runs/NAME of CONFIG].")
+@overrides
+@parallel
+@speaking
+def study(
+    console: Console, config: Path, data: Path | None, out: Path | None, overrides: tuple[str, ...], parallel: Executor
+) -> None:
+    """Compare the variants that CONFIG lists by cross-validated error, and trained at one group of records each."""
+    watch = Stopwatch()
+    folder = out or Path("runs") / config.stem
+    kept = click.get_current_context().with_resource(reserved(folder, FILES))
+    configured = Study.load(config, overrides, data, console.registry())
+    with console.progress() as progress:
+        result = compare(configured, parallel, command_line(), progress, watch)
+    for text in result.warnings:
+        console.warn(text)
+    for stage, seconds in result.seconds.items():
+        console.detail(f"{stage}: {seconds:.3f} s")
+    for v in result.variants:
+        console.detail(f"{v.name}: {v.fit_seconds:.2f} s for the fit on all records, {v.seconds:.2f} s for all fits")
+    result.seconds["total"] = watch.total()
+    sources = {name: experiment.source for name, experiment in configured.experiments.items()}
+    document = study_document(result)
+    kept.place(files(result, configured.source, sources, page(document)))
+    console.show(document, folder=str(folder))
+    console.line(f"page: {folder / 'study.html'}  ({watch.total():.1f} s)")
