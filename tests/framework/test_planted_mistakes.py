@@ -59,7 +59,7 @@ def planted(name: str, folder: Path, arm: PlantedArm = PRINTED, seed: int = 1) -
         ("z in centimetres for millimetres", "refused", "with z 10 times as large"),
         ("half the rows in metres", "refused", "100 of 200 positions are about 0.001 times as far"),
         ("base 200 mm off and held", "refused", "the arm's base elsewhere by 198 mm"),
-        ("base turned by 3 deg and held", "bad", "of the arm's reach, and other records predict"),
+        ("base turned by 3 deg and held", "bad", "of its variance is not noise: the model misses it"),
         ("a slip of 3 deg after a third", "bad", "contradict the others"),
     ],
 )

@@ -222,8 +222,7 @@ def gross(fit: Fit) -> list[Finding]:
     test = (
         f"limits {100 * limit:g} % and {100 * EXPLAINED:.0f} %; one cause explains {100 * explained:.0f} % of the error"
     )
-    by_time = left.predictable is not None and left.predictable.cause == "time"
-    return [Finding("bad", text, test, _MOVED if by_time else _LOOK)]
+    return [Finding("bad", text, test, _MOVED if left.goes_with_time else _LOOK)]
 
 
 def jumped(fit: Fit) -> list[Finding]:

@@ -42,6 +42,7 @@ MOST_RECORDS = 1000
 WORTHWHILE = 0.01
 DRAWS, FEWER_DRAWS = 999, 299
 """Of chance: for the test that decides whether anything is named; in those after it, and where they show enough."""
+OVER_TIME = ("order", "step", "slip", "bump")  # Kinds of causes
 UNLISTED = "something that is none of these"
 CHANGING = "something that changes with time and is none of these"
 CHANCE = "nothing: it may be chance"
@@ -193,6 +194,14 @@ class ResidualStructure:
     def shows(self) -> bool:
         """Whether residuals are more than noise."""
         return bool(self.structures) or self.predictable is not None
+
+    @property
+    def goes_with_time(self) -> bool:
+        """Whether the largest part of them does, and the pose does not tell the time."""
+        largest = max(self.structures, key=lambda s: s.falls_mm, default=None)
+        if largest is None:
+            return self.predictable is not None and self.predictable.cause == "time"
+        return not self.in_order and largest.kind in OVER_TIME
 
     @property
     def falls(self) -> float:

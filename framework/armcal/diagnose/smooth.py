@@ -12,6 +12,7 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from scipy.linalg import eigh
 
 from armcal.arm.assembly import command_channels, shown_joint
 from armcal.base.arrays import Array, Indices
@@ -79,7 +80,7 @@ class Smooth:
         parts = []
         for one in functions:
             columns = one.columns - basis @ (basis.T @ one.columns)
-            values, vectors = np.linalg.eigh(columns.T @ columns)
+            values, vectors = eigh(columns.T @ columns)
             kept = values > 1e-9 * max(float(values[-1]), 1e-300)
             parts.append((columns @ (vectors[:, kept] / np.sqrt(values[kept])), values[kept]))
         return cls(basis, tuple(parts))
@@ -169,7 +170,7 @@ class Recorded:
 
     def _of_kernel(self, kernel: Array) -> Functions:
         """Functions of the records that correlate so (N x N), the smoothest ones."""
-        values, vectors = np.linalg.eigh(kernel)
+        values, vectors = eigh(kernel)
         most = max(1, _MOST_ENTRIES // self.rows.by_record.shape[1])
         kept = np.flatnonzero(values > _SMALLEST * values[-1])[::-1][:most]
         features = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
