@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,15 +12,12 @@ import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.causes import predicted_positions
 from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.held import contradictions
-from armcal.diagnose.outliers import large_errors, suspicious_ids
 from armcal.diagnose.residual_structure import LEVEL, UNLISTED, neighbour_findings, structure, structure_findings
-from armcal.diagnose.unseen import rounding, scale_deviation
-from armcal.diagnose.verdict import _in_short, suggestions
+from armcal.diagnose.unseen import scale_deviation
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
-from fits import fit_of, fit_that_found
+from fits import fit_of
 from noise_cases import NOISE_M, posed
 
 DEG = np.pi / 180
@@ -137,24 +133,6 @@ def test_what_is_not_among_the_causes_is_not_given_the_name_of_one(smooth):
     found = smooth
     assert graded(found, "smooth") != "wrong" and found.predictable is not None
     assert "is not noise: other records predict it" in said(found)
-
-
-@pytest.mark.slow
-def test_in_short_nothing_is_left_only_where_no_function_of_the_pose_is(smooth):
-    found = smooth
-    solved = {"verdict": SimpleNamespace(converged=True), "identifiability": SimpleNamespace(undetermined=())}
-
-    def short(rest, times=1.0):
-        sure = SimpleNamespace(**solved, noise_scale=times, degrees_of_freedom=100)
-        left = replace(found, structures=(), predictable=rest)
-        nothing = {contradictions: (), rounding: None, large_errors: None, suspicious_ids: [], suggestions: ()}
-        return " ".join(_in_short(fit_that_found(sure, {structure: left, **nothing}, unit="mm"), ""))
-
-    assert "is not noise: other records predict it" in short(found.predictable) and "nothing" not in short(
-        found.predictable
-    )
-    assert "nothing that was recorded predicts them" in short(None)
-    assert "look like noise" not in short(None, 37.0) and "yet they are 37.0 times the declared" in short(None, 37.0)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.outliers import outlier_findings, suspicious_in_short, suspicious_records
+from armcal.diagnose.outliers import outlier_findings, suspicious_records
 from armcal.diagnose.verdict import _good_for
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import POOR_CONDITION, analyse
@@ -122,7 +122,7 @@ def test_gross_errors_are_counted(tmp_path: Path) -> None:
         "3 training records lie farther from the fit than noise allows, the worst" in f["text"]
         for f in verdict["findings"]
     )
-    assert "3 of 200 training records are suspicious, by id: " in verdict["paragraph"]
+    assert "3 training records lie farther from the fit" in verdict["paragraph"]
 
 
 @pytest.mark.parametrize("count", [12, 20, 100, 300])
@@ -136,10 +136,8 @@ def test_noise_alone_is_seldom_a_large_error_of_ranges_as_of_positions(rows: int
     assert sum("7" in suspicious_records(errors, rows, [*map(str, range(count))], None) for errors in drawn) > 950
 
 
-def test_an_id_does_not_read_as_a_number_of_records_and_many_suspects_are_none() -> None:
-    assert suspicious_in_short(["2020"], 2224) == "1 of 2224 training records is suspicious, by id: 2020."
+def test_many_suspects_are_none() -> None:
     many = [str(i) for i in range(50)]
-    assert "50 of 200 training records lie beyond the limit" in suspicious_in_short(many, 200)
     (finding,) = outlier_findings(many, [str(i) for i in range(200)], None)
     assert "So many are no outliers: their noise is larger" in finding.text and "residuals.csv" in finding.action
     assert "noise.loss: reject" in outlier_findings(many[:30], [str(i) for i in range(200)], None)[0].action
@@ -178,7 +176,7 @@ def test_missed_records_are_listed_where_the_limit_says(tmp_path: Path) -> None:
     assert all(m["error_mm"] > 15 and m["advice"] for m in missed["explained"])
     finding = next(f for f in run["verdict"]["findings"] if "an error above 6.00 mm" in f["text"])
     assert finding["grade"] == "warning" and "validation.limit_mm" in finding["test"]
-    assert "Error above 6.00 mm" in run["verdict"]["paragraph"]
+    assert finding["text"] in run["verdict"]["paragraph"]
     assert "an error above 6.00 mm by fits that did not see them" in (tmp_path / "run" / "report.html").read_text()
     relaxed = judged("validation.limit_mm=60", data=data)
     assert relaxed["structure"]["large_errors"]["beyond"] == 0
@@ -213,7 +211,6 @@ def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tm
     assert found["grade"] == "note" and "does not depend on them" in found["text"]
     assert len(found["text"]) < 200 and "armcal identify" in found["action"]
     assert run["structure"]["priors_alone"]["worst_mm"] < 1e-6
-    assert "Not determined" in run["verdict"]["paragraph"]
 
 
 @pytest.mark.slow
@@ -228,8 +225,7 @@ def test_terminal_and_report_say_what_the_json_says(tmp_path: Path) -> None:
     assert claim in shown and escape(claim, quote=False).replace("'", "&#39;") in page
     (warning,) = (f for f in told["findings"] if f["grade"] == "warning" and "an error above 1.40 mm" in f["text"])
     assert warning["text"] in shown and warning["action"] in shown
-    assert "Error above 1.40 mm" in told["paragraph"]
-    assert "Error above 1.40 mm" not in shown, "what a warning says is not said before it, too"
+    assert warning["text"] in told["paragraph"] and shown.count("an error above 1.40 mm") == 1
     for finding in told["findings"]:
         for part in ("text", "test", "action"):
             assert escape(finding[part], quote=False).replace("'", "&#39;") in page

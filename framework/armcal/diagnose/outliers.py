@@ -255,16 +255,6 @@ def outlier_findings(suspicious: Sequence[str], ids: Sequence[str], fitted: Weig
     return [Finding("warning", text, test, "Measure them again, or set noise.loss: reject; residuals.csv has all.")]
 
 
-def suspicious_in_short(ids: Sequence[str], records: int) -> str:
-    """How many of the training records, and which: an id alone, such as 2020, would read as their number."""
-    if not ids:
-        return "No training record is suspicious."
-    if len(ids) > MOST_SUSPICIOUS * records:
-        return f"{len(ids)} of {records} training records lie beyond the limit for outliers: {_TOO_MANY}."
-    verb = "is" if len(ids) == 1 else "are"
-    return f"{len(ids)} of {records} training records {verb} suspicious, by id: {first_few(ids)}."
-
-
 def component_findings(components: VarianceComponents) -> list[Finding]:
     joints = components.share("joint")
     parts = sorted(components.components, key=lambda c: -c.share)

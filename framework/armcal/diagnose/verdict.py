@@ -1,6 +1,6 @@
 """The verdict: what a person should conclude, each sentence from a check; and the checks of an estimate itself."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -17,10 +17,10 @@ from armcal.diagnose.coverage import predictions
 from armcal.diagnose.data import still_joints
 from armcal.diagnose.fit import Fit
 from armcal.diagnose.gross import by_halves
-from armcal.diagnose.held import contradictions, instruments
-from armcal.diagnose.outliers import MOST_TOLD, component_findings, large_errors, suspicious_ids, suspicious_in_short
-from armcal.diagnose.residual_structure import FEWEST_POSES, predicted_in_short, repeat_findings, structure
-from armcal.diagnose.unseen import Elsewhere, determined, elsewhere, hidden_payload, priors_alone, rounded, rounding
+from armcal.diagnose.held import contradictions
+from armcal.diagnose.outliers import MOST_TOLD, component_findings, large_errors
+from armcal.diagnose.residual_structure import structure
+from armcal.diagnose.unseen import Elsewhere, elsewhere, hidden_payload, priors_alone, rounding
 from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.prediction import NewRecording
@@ -45,15 +45,19 @@ _ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
 
 @dataclass(frozen=True)
 class Verdict:
-    """The findings, the worst first, one line that sums them up, and a paragraph that a technician can act on."""
+    """The findings, the worst first, and sentences that sum them up."""
 
     headline: str
     findings: tuple[Finding, ...]
-    sentences: tuple[str, ...] = ()  # of the paragraph; the first says how good the model is on unseen poses
+    claim: str = ""  # how good the model is on unseen poses
+    next_poses: str = ""  # which to measure next; empty where more would not help much
 
     @property
     def paragraph(self) -> str:
-        return " ".join(self.sentences)
+        """The claim, or why there is none; what is bad or a warning; what to measure next."""
+        urgent = [finding.text for finding in self.findings if finding.grade in ("bad", "warning")]
+        first = f"{DO_NOT_USE}:" if self.bad else self.claim
+        return " ".join(filter(None, (first, *urgent, self.next_poses)))
 
     @property
     def grade(self) -> Literal["good", "usable with care", "bad"]:
@@ -82,10 +86,12 @@ def in_all(fit: Fit, ranked: Sequence[Finding]) -> Verdict:
     judged_on = f"{held} held-out records" if held else "cross-validation"
     judged_on += ", as in a new recording (its drift not known)" if fit.drifts else ""
     headline = _errors_text(fit, judged_mm, judged_on)
-    first = _good_for(judged_mm, judged_on, fit.unit, fit.of(new_recording), fit.of(elsewhere))
+    claim = _good_for(judged_mm, judged_on, fit.unit, fit.of(new_recording), fit.of(elsewhere))
     if ranked[0].grade == "bad":
-        headline, first = f"{DO_NOT_USE}. {headline}", f"{DO_NOT_USE}: {ranked[0].text}"
-    return Verdict(headline, tuple(ranked), tuple(_in_short(fit, first)))
+        headline = f"{DO_NOT_USE}. {headline}"
+    poses = fit.of(suggestions)
+    further = f"Measure these poses next: {in_words(poses)}." if is_worth_measuring(poses) else ""
+    return Verdict(headline, tuple(ranked), claim, further)
 
 
 def new_recording(fit: Fit) -> NewRecording | None:
@@ -169,51 +175,6 @@ def _good_for(
         f"{claim} +- {readable(limit)} {unit} on unseen poses like these: 95 % of them, with 95 % confidence "
         f"({judged_on})."
     )
-
-
-def _in_short(fit: Fit, first: str) -> Iterator[str]:
-    if not fit.converged:
-        yield "The solver did not converge: these values are no calibration."
-        return
-    yield first
-    if fit.estimate.identifiability.undetermined:
-        (finding,) = determined(fit)
-        yield f"Not determined: {finding.text[:1].lower()}{finding.text[1:]}"
-    missed = fit.of(large_errors)
-    if missed is not None and missed.beyond:
-        ids = ", ".join(miss.record_id for miss in missed.explained[:MOST_TOLD])
-        more = f" and {missed.beyond - MOST_TOLD} more" if missed.beyond > MOST_TOLD else ""
-        named = "the record" if missed.beyond == 1 else f"{missed.beyond} records"
-        yield f"Error {missed.in_words(fit.unit)} in {named}, by id: {ids}{more}."
-    yield suspicious_in_short(fit.of(suspicious_ids), len(fit.split.train))
-    yield from _left(fit)
-    if is_worth_measuring(fit.of(suggestions)):
-        yield f"Measure these poses next: {in_words(fit.of(suggestions))}."
-
-
-def _left(fit: Fit) -> list[str]:
-    """What is left in the residuals; that nothing was found only where all that was looked at says so."""
-    left, estimate = fit.of(structure), fit.estimate
-    sentences = [finding.text for finding in (*instruments(fit), *rounded(fit))]
-    if left is None:
-        return sentences or ["Whether the model lacks anything is not known: the training records are too few."]
-    sentences += [finding.text for finding in repeat_findings(left, fit.unit)]
-    if left.predictable is not None:
-        sentences.append(predicted_in_short(left))
-    if left.worthwhile:
-        listed = "; ".join(
-            f"{s.words}{', or on another cause' if s.alternatives else ''} ({readable(s.falls_mm)} {fit.unit})"
-            for s in left.worthwhile
-        )
-        sentences.append(f"Residuals still depend on {listed}.")
-    elif not sentences and left.poses < FEWEST_POSES:
-        sentences.append("None of the tested causes explains the residuals; for others the poses are too few.")
-    elif not sentences and _is_beyond_noise(estimate):
-        text = "Nothing that was recorded predicts the residuals, yet they are "
-        sentences.append(f"{text}{estimate.noise_scale:.1f} times the declared noise.")
-    elif not sentences:
-        sentences.append("The residuals look like noise: nothing that was recorded predicts them.")
-    return sentences
 
 
 def _is_beyond_noise(estimate: Estimate) -> bool:

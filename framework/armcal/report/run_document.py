@@ -8,10 +8,8 @@ import numpy as np
 
 from armcal.base.units import readable
 from armcal.diagnose.checks import Finding
-from armcal.diagnose.verdict import suggestions
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import CORRELATED, bound_together, correlated_pairs, correlations
-from armcal.planning.suggestion import is_worth_measuring
 from armcal.plugins import PluginRegistry, said
 from armcal.report import run_figures as figures
 from armcal.report import run_tables as tables
@@ -58,10 +56,8 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
     notes = [finding for finding in findings if finding.grade == "note"]
     passed = [finding for finding in findings if finding.grade == "good"]
     grade = next((g for g in ("bad", "warning") if g in {f.grade for f in findings}), "good" if findings else "note")
-    sentences = result.verdict.sentences
-    summary: list[Part] = [] if result.verdict.bad else [*sentences[:1]]  # what findings say is not said twice
-    if len(sentences) > 1 and is_worth_measuring(result.fit.of(suggestions)):
-        summary.append(sentences[-1])
+    verdict = result.verdict
+    summary: list[Part] = list(filter(None, ("" if verdict.bad else verdict.claim, verdict.next_poses)))
     if findings and not urgent:
         summary.append("No warning: the calibration can be used.")
     own = [
