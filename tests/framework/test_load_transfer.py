@@ -53,9 +53,9 @@ def _run(path: Path, *overrides: str, data: Path | None = None, executor=None) -
 
 
 def _mean(result: StudyResult, variant: str, trained: tuple[str, ...], judged: str) -> float:
-    cells = [c for c in result.cells if (c.variant, c.trained, c.judged) == (variant, trained, judged)]
+    cells = [c for c in result.cells if (c.variant, c.trained_at, c.judged_at) == (variant, trained, judged)]
     assert len(cells) == 1
-    return cells[0].errors.mean
+    return cells[0].error_mm.mean
 
 
 def _measured(place: Path, grams: dict[float, int], column: str = "payload_g") -> Path:
@@ -114,10 +114,12 @@ def test_a_cell_at_another_load_is_a_run_at_one_judged_on_the_other(plain: Path)
             held = run.table.calibrated["holdout"]
             assert held.mean == pytest.approx(_mean(result, "elastic", (trained,), judged), rel=1e-9)
         assert [group.name for group in run.groups] == ["0 g", "66.3 g"]
-        cell = next(c for c in result.cells if (c.variant, c.trained, c.judged) == ("elastic", (trained,), judged))
-        assert not cell.seen and cell.errors.count == held.count
-        assert cell.errors.mean == pytest.approx(held.mean, rel=1e-9)
-        assert cell.errors.p95 == pytest.approx(held.p95, rel=1e-9)
+        cell = next(
+            c for c in result.cells if (c.variant, c.trained_at, c.judged_at) == ("elastic", (trained,), judged)
+        )
+        assert not cell.cross_validated and cell.error_mm.count == held.count
+        assert cell.error_mm.mean == pytest.approx(held.mean, rel=1e-9)
+        assert cell.error_mm.p95 == pytest.approx(held.p95, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -138,13 +140,13 @@ def test_records_that_were_measured_give_what_their_simulation_gave(place: Path,
     measured = _run(place / "study.yaml", data=data)
     assert not measured.simulated and measured.dataset.ids == simulated.dataset.ids
     for one, other in zip(simulated.cells, measured.cells, strict=True):
-        assert (one.variant, one.trained, one.judged, one.seen) == (
+        assert (one.variant, one.trained_at, one.judged_at, one.cross_validated) == (
             other.variant,
-            other.trained,
-            other.judged,
-            other.seen,
+            other.trained_at,
+            other.judged_at,
+            other.cross_validated,
         )
-        assert one.errors.mean == pytest.approx(other.errors.mean, rel=1e-6)
+        assert one.error_mm.mean == pytest.approx(other.error_mm.mean, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -173,7 +175,7 @@ def test_no_figure_rests_on_a_record_that_it_judges(plain: Path) -> None:
 def test_payloads_are_told_apart_to_a_tenth_of_a_gram(plain: Path) -> None:
     everything = _run(plain / "study.yaml", data=_measured(plain, {120: 10, 66.3: 20, 66.32: 5, 0: 20}))
     assert list(everything.groups.items()) == [("0 g", 20), ("66.3 g", 25), ("120 g", 10)]
-    assert {c.trained for c in everything.cells} == {(), ("0 g",), ("66.3 g",), ("120 g",), tuple(everything.groups)}
+    assert {c.trained_at for c in everything.cells} == {(), ("0 g",), ("66.3 g",), ("120 g",), tuple(everything.groups)}
 
 
 @pytest.mark.slow

@@ -86,13 +86,13 @@ def _transfers(result: StudyResult) -> list[str]:
     """How much an error grows from the group that trained to another."""
     texts, several = [], len(result.groups) > _FEW_GROUPS
     for variant in result.variants:
-        single = [c for c in result.cells if c.variant == variant.name and len(c.trained) == 1]
-        own = {c.judged: c.errors.mean for c in single if c.seen}
-        pairs = [(c, own[c.judged]) for c in single if not c.seen and c.errors.mean is not None]
+        single = [c for c in result.cells if c.variant == variant.name and len(c.trained_at) == 1]
+        own = {c.judged_at: c.error_mm.mean for c in single if c.cross_validated}
+        pairs = [(c, own[c.judged_at]) for c in single if not c.cross_validated and c.error_mm.mean is not None]
         if several:  # the worst of many
-            pairs = sorted(pairs, key=lambda pair: -(pair[0].errors.mean or 0.0))[:1]
+            pairs = sorted(pairs, key=lambda pair: -(pair[0].error_mm.mean or 0.0))[:1]
         said = [
-            f"{c.trained[0]} to {c.judged} {_shown(c.errors.mean, result.unit)}, against "
+            f"{c.trained_at[0]} to {c.judged_at} {_shown(c.error_mm.mean, result.unit)}, against "
             f"{_shown(at_home, result.unit)} there"
             for c, at_home in pairs
         ]
@@ -123,7 +123,7 @@ def _variants(result: StudyResult) -> Table:
 def _rows(result: StudyResult) -> dict[tuple[str, tuple[str, ...]], list[Cell]]:
     rows: dict[tuple[str, tuple[str, ...]], list[Cell]] = {}
     for cell in result.cells:
-        rows.setdefault((cell.variant, cell.trained), []).append(cell)
+        rows.setdefault((cell.variant, cell.trained_at), []).append(cell)
     return rows
 
 
@@ -135,22 +135,22 @@ def _trained(trained: Sequence[str], result: StudyResult) -> str:
 
 def _cells(result: StudyResult) -> Table:
     """A row for each variant and what it was trained at, errors at each group beside one another."""
-    decimals = common_decimals([c.errors.mean for c in result.cells], most=3)
+    decimals = common_decimals([c.error_mm.mean for c in result.cells], most=3)
     few, rows = len(result.groups) <= _FEW_GROUPS, []
     for (variant, trained), cells in _rows(result).items():
         words = _trained(trained, result)
         words += f" ({plural(cells[0].failed_fits, 'fit')} failed)" if cells[0].failed_fits else ""
         figures = [
-            fixed(x, digits) + ("*" if trained and not cell.seen else "")
+            fixed(x, digits) + ("*" if trained and not cell.cross_validated else "")
             for cell in cells
             for x, digits in (
-                (cell.errors.mean, decimals),
-                *([(cell.errors.p95, decimals)] if few else []),
-                *([(cell.turns.mean, 3)] if cell.turns else []),
+                (cell.error_mm.mean, decimals),
+                *([(cell.error_mm.p95, decimals)] if few else []),
+                *([(cell.orientation_error_deg.mean, 3)] if cell.orientation_error_deg else []),
             )
         ]
         rows.append((variant, words, *figures))
-    names = ["mean", *(["95 %"] if few else []), *(["turn mean, deg"] if result.cells[0].turns else [])]
+    names = ["mean", *(["95 %"] if few else []), *(["turn mean, deg"] if result.cells[0].orientation_error_deg else [])]
     headings = ["Variant", "Trained at"]
     headings += [f"{group}, {name}" if len(names) > 1 else group for group in result.groups for name in names]
     counts = ", ".join(f"{n} at {group}" for group, n in result.groups.items())

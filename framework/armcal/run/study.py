@@ -138,30 +138,18 @@ class NestedResult:
 
 @dataclass(frozen=True)
 class Cell:
-    """One variant trained at some groups of records and judged at one (mm).
-
-    ``trained`` is empty for the nominal model; with ``seen`` the records that judge were of a group that also
-    trained, and were kept out of the training by folds. ``turns`` are errors of orientations (deg), where measured.
-    """
+    """One variant trained at some groups of records and judged at one, as JSON has it."""
 
     variant: str
-    trained: tuple[str, ...]
-    judged: str
-    errors: ErrorSummary
-    seen: bool
+    trained_at: tuple[str, ...]  # none for the nominal model
+    judged_at: str
+    error_mm: ErrorSummary
+    cross_validated: bool  # the group also trained: its records were kept out of the training by folds
     failed_fits: int
-    turns: ErrorSummary | None = None
+    orientation_error_deg: ErrorSummary | None = None  # where orientations are measured
 
     def as_dict(self) -> dict[str, Any]:
-        return {
-            "variant": self.variant,
-            "trained_at": list(self.trained),
-            "judged_at": self.judged,
-            "error_mm": asdict(self.errors),
-            **({"orientation_error_deg": asdict(self.turns)} if self.turns else {}),
-            "cross_validated": self.seen,
-            "failed_fits": self.failed_fits,
-        }
+        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
