@@ -2,12 +2,11 @@
 
 import sys
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
-from armcal.cli.common import FILE, Console, command_line, speaking
+from armcal.cli.common import FILE, Console, speaking
 from armcal.errors import InputError
 
 from armcal_lerobot.motor_file import Units, read_motors
@@ -32,29 +31,26 @@ _UNITS = click.option(
     type=click.Choice(["degrees", "percent"]),
     default="degrees",
     show_default=True,
-    help="Of a data set's numbers, as use_degrees was when it was recorded.",
+    help="Of recorded numbers, as use_degrees was.",
 )
 
 
 @lerobot.command()
 @click.argument("calibration", type=FILE)
 @click.argument("other", type=FILE, required=False)
-@click.option("--data", "folder", type=FILE, help="A data set whose poses count [default: the files' ranges].")
 @_UNITS
 @_of_arm
 @speaking
-def check(console: Console, calibration: Path, other: Path | None, folder: Path | None, **given: Any) -> None:
+def check(console: Console, calibration: Path, other: Path | None, **given: Any) -> None:
     """Check a calibration file; what its zeros cost in mm.
 
     With OTHER (yesterday's file and today's) also how far the same command moves each joint, and the gripper.
     """
     from armcal_lerobot.comparison import check_content, show_check
 
-    if folder is not None and given["config"] is None:
-        raise InputError("found --data without --arm.", hint="Give --arm CONFIG: poses matter for mm at its gripper.")
     file, second = read_motors(calibration), read_motors(other) if other else None
     gripper = _gripper(console, list(file.motors), **given)
-    content = check_content(file, second, gripper, folder, given["units"])
+    content = check_content(file, second, gripper, given["units"])
     console.result(content)
     for note in content["notes"]:
         console.warn(note)
@@ -127,40 +123,25 @@ def zeros(console: Console, calibrated: Path, calibration: Path, arm_name: str |
 
 @lerobot.command()
 @click.argument("dataset", type=FILE)
-@click.argument("second", metavar="[DATASET2]", type=FILE, required=False)
 @click.option("--calibration", type=FILE, help="The follower's calibration file: turns percent into degrees.")
-@click.option("--out", type=FILE, help="A page to write (HTML).")
 @_UNITS
 @_of_arm
 @speaking
-def compare(console: Console, dataset: Path, second: Path | None, out: Path | None, **given: Any) -> None:
+def compare(console: Console, dataset: Path, calibration: Path | None, units: Units, **given: Any) -> None:
     """How a follower follows its commands, joint by joint.
 
-    Offset, gain, backlash and delay from recorded data, with intervals; of two data sets also what differs.
+    Offset, gain, backlash and delay from recorded data, with intervals.
     """
     from armcal_lerobot.comparison import compare_content, document
     from armcal_lerobot.recordings import open_recording
     from armcal_lerobot.tracking import read_motion
 
-    units, calibration = given["units"], given.pop("calibration")
     file = read_motors(calibration) if calibration else None
-    read = partial(read_motion, units=units, file=file)
-    motions = [read(open_recording(folder)) for folder in (dataset, second) if folder]
-    if len(motions) == 2 and set(motions[0].motors) != set(motions[1].motors):
-        text = f"found the motors {', '.join(motions[1].motors)} in {second}, expected {', '.join(motions[0].motors)}."
-        raise InputError(text, hint="Compare data sets of arms with the same motors.")
-    gripper = _gripper(console, list(motions[0].motors), **given)
+    motion = read_motion(open_recording(dataset), units, file)
+    gripper = _gripper(console, list(motion.motors), **given)
     if gripper and units == "percent" and file is None:
         raise InputError("found numbers in percent, expected degrees for mm.", hint="Give --calibration FILE as well.")
-    content = {"data": [str(folder) for folder in (dataset, second) if folder], **compare_content(motions, gripper)}
-    shown = document(content, command_line())
-    console.show(shown)
-    if out is not None:
-        from armcal.io.plain_files import write_over
-        from armcal.report.page import page
-
-        write_over({out: page(shown).encode()})
-        console.line(f"page: {out}")
+    console.show(document({"data": str(dataset), **compare_content(motion, gripper)}))
 
 
 @lerobot.command()

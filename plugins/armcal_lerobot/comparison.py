@@ -1,10 +1,10 @@
-"""What a data set says of leader and follower, or two data sets of two arms: named faults, and mm at the gripper."""
+"""What calibration files cost in mm at the gripper, and what a data set says of leader and follower."""
 
 import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,7 @@ from armcal.base.arrays import Array
 from armcal.calibration.joint_zeros import Zero
 from armcal.cli.common import Console
 from armcal.errors import DataError, InputError, Location
-from armcal.report.document import Code, Document, Section, Table
-from scipy.stats import t as student
+from armcal.report.document import Document, Section, Table
 
 from armcal_lerobot.motor_file import (
     COUNTS_A_TURN,
@@ -34,34 +33,18 @@ from armcal_lerobot.motor_file import (
     teeth_of,
     zero_shift_deg,
 )
-from armcal_lerobot.recordings import open_recording
 from armcal_lerobot.rest_records import Cost, Gripper, require_single, wiring_of
 from armcal_lerobot.tracking import (
     SLOW_A_SECOND,
-    Figure,
     Motion,
     Torque,
     Tracking,
     delayed,
-    read_motion,
     require_motors,
     trackings,
 )
 
-_FEWEST_STARTS = 3
 _SAME_GAIN = 0.03
-_STEADY_START = 5.0
-_MOST_POSES = 5000
-
-
-@dataclass(frozen=True)
-class Shift:
-    """How far the second data set's episodes begin from the first's, of one motor; ``doubt`` where that says little."""
-
-    motor: str
-    unit: str
-    start: Figure | None
-    doubt: str = ""
 
 
 def gravity_of(gripper: Gripper, motors: Sequence[str]) -> Torque | None:
@@ -81,48 +64,25 @@ def gravity_of(gripper: Gripper, motors: Sequence[str]) -> Torque | None:
     return torque
 
 
-def gripper_error(motion: Motion, trackings: Sequence[Tracking], gripper: Gripper) -> tuple[Cost | None, Cost]:
-    """How far the gripper is from where it was commanded: at rest (None if it never rests), and of all frames.
+def error_at_rest(motion: Motion, trackings: Sequence[Tracking], gripper: Gripper) -> Cost | None:
+    """How far the gripper rests from where it was commanded; None if it never rests.
 
-    At rest the command is taken as late as the motors follow it.
+    The command is taken as late as the motors follow it.
     """
     delays = [t.delay_s.value for t in trackings if t.delay_s]
     frames = float(np.median(delays)) * motion.fps if delays else 0.0
-    moving, rest = [], []
+    distances = []
     for stretch in motion.stretches:
-        command, state = (_poses(gripper, motion, part) for part in (stretch.commanded, stretch.reached))
-        moving.append(np.linalg.norm(gripper.positions(command) - gripper.positions(state), axis=0))
         late = np.apply_along_axis(delayed, 0, stretch.commanded, frames)
         speed = np.abs(np.gradient(late, axis=0)).max(axis=1) * motion.fps
         slow = np.isfinite(speed) & (speed < SLOW_A_SECOND)
-        if slow.any():
-            held = _poses(gripper, motion, late[slow])
-            rest.append(np.linalg.norm(gripper.positions(held) - gripper.positions(state[:, slow]), axis=0))
-    return Cost.of(np.concatenate(rest)) if rest else None, Cost.of(np.concatenate(moving))
-
-
-def poses_of(motion: Motion, gripper: Gripper) -> Array:
-    """Joint angles (n x N; rad) that a data set's states have, at most 5000."""
-    degrees = motion.reached_degrees()
-    step = max(1, motion.frames // _MOST_POSES)
-    return gripper.angles({name: values[::step] for name, values in degrees.items()})
-
-
-def shifts(one: Motion, two: Motion) -> tuple[Shift, ...]:
-    """How far apart the episodes of two data sets begin, by motor of the first; arms rest where they are put."""
-    made = []
-    for index, motor in enumerate(one.motors):
-        first, second = one.starts[:, index], two.starts[:, two.motors.index(motor)]
-        if min(len(first), len(second)) < _FEWEST_STARTS:
-            made.append(Shift(motor, one.units[index], None, f"fewer than {_FEWEST_STARTS} episodes in one of them"))
-            continue
-        spreads = [float(np.std(starts, ddof=1)) for starts in (first, second)]
-        error = np.hypot(*(s / np.sqrt(len(v)) for s, v in zip(spreads, (first, second), strict=True)))
-        half = float(student.ppf(0.975, min(len(first), len(second)) - 1) * error)
-        apart = float(second.mean() - first.mean())
-        doubt = "episodes begin at different poses" if max(spreads) > _STEADY_START else ""
-        made.append(Shift(motor, one.units[index], Figure(apart, apart - half, apart + half), doubt))
-    return tuple(made)
+        places = [
+            gripper.positions(gripper.angles({name: values[slow, i] for i, name in enumerate(motion.motors)}))
+            for values in (late, stretch.reached)
+        ]
+        distances.append(np.linalg.norm(places[0] - places[1], axis=0))
+    apart = np.concatenate(distances)
+    return Cost.of(apart) if len(apart) else None
 
 
 def copy_findings(motion: Motion) -> list[str]:
@@ -165,48 +125,16 @@ def findings_of(trackings: Sequence[Tracking]) -> list[str]:
     return texts
 
 
-def shift_findings(moved: Sequence[Shift], one: Motion, two: Motion) -> list[str]:
-    """What the shifts say, a sentence each."""
-    texts = []
-    for shift in moved:
-        if shift.start is None or shift.doubt or not (shift.start.low > 0 or shift.start.high < 0):
-            continue
-        apart = shift.start.value
-        first, second = (float(m.starts[:, m.motors.index(shift.motor)].mean()) for m in (one, two))
-        teeth = teeth_of(apart) if shift.unit == "deg" else 0
-        if abs(first + second) < abs(apart) / 5 and abs(first) > 10:
-            texts.append(f"{shift.motor} is inverted in one of them: it begins at {first:+.1f} and {second:+.1f}.")
-        elif teeth:
-            texts.append(f"{shift.motor} begins {apart:+.1f} deg elsewhere: {teeth_text(teeth)} would explain that.")
-        elif abs(apart) > 1.0:
-            texts.append(
-                f"{shift.motor} begins {apart:+.1f} {shift.unit} elsewhere: its zero differs, or where it was put."
-            )
-    return texts
-
-
-def costs_at(gripper: Gripper, angles: Array, figures: Mapping[str, float]) -> dict[str, float]:
-    """Median mm at the gripper of angles (deg) by motor, over poses (n x N; rad)."""
-    each_degree = {gripper.motor_of(joint)[0]: cost for joint, cost in gripper.per_degree(angles).items()}
-    return {name: abs(value) * each_degree[name].typical_mm for name, value in figures.items() if name in each_degree}
-
-
-def _poses(gripper: Gripper, motion: Motion, values: Array) -> Array:
-    return gripper.angles({name: values[:, i] for i, name in enumerate(motion.motors)})
-
-
 _MOST_UNSWEPT_DEG = 6.0
 _LEAST_SHIFT_DEG = 0.2
 _PRIOR_DEG = 3.0
 
 
-def check_content(
-    file: MotorFile, other: MotorFile | None, gripper: Gripper | None, folder: Path | None, units: Units
-) -> dict[str, Any]:
+def check_content(file: MotorFile, other: MotorFile | None, gripper: Gripper | None, units: Units) -> dict[str, Any]:
     """All that is known of a file, of two, and of the gripper.
 
     Raises:
-        InputError: motors are missing, or a data set is refused.
+        InputError: motors are missing.
     """
     if other is not None:
         require_motors(other, list(file.motors))
@@ -222,9 +150,7 @@ def check_content(
     if gripper is None:
         return content
     angles = gripper.poses(file.motors)
-    if folder is not None:
-        angles = poses_of(read_motion(open_recording(folder), units, file), gripper)
-    content["poses"] = "of the data set" if folder else "drawn from the ranges of the file"
+    content["poses"] = "drawn from the ranges of the file"
     for joint, cost in gripper.per_degree(angles).items():
         content["motors"][gripper.motor_of(joint)[0]]["mm_per_deg"] = asdict(cost)
     if other is not None:
@@ -444,120 +370,53 @@ def _pair(cost: Mapping[str, float] | None) -> str:
 
 
 LIMITS_OF_DATA = (
-    "What one data set cannot show: its unit (degrees are assumed; else --units percent), a wrong zero of leader or "
+    "What a data set cannot show: its unit (degrees are assumed; else --units percent), a wrong zero of leader or "
     "follower (the follower is sent the leader's numbers and answers in its own), and play between a servo's encoder "
-    "and the link. Compare two calibration files (armcal lerobot check), two data sets, or measure the gripper (armcal "
-    "run)."
+    "and the link. Compare two calibration files (armcal lerobot check), or measure the gripper (armcal run)."
 )
-_FIGURES = ("delay_s", "gain", "offset", "backlash", "load")
+_COLUMNS = (("gain", 1, 3), ("offset", 1, 2), ("backlash", 1, 2), ("delay_s", 1000, 0))
 
 
-def compare_content(motions: Sequence[Motion], gripper: Gripper | None) -> dict[str, Any]:
-    """Everything that one data set says, or two, and what differs from the first to the second."""
-    followed = [trackings(m, gravity_of(gripper, m.motors) if gripper else None) for m in motions]
-    sets = [_content(motion, of_set, gripper) for motion, of_set in zip(motions, followed, strict=True)]
-    content: dict[str, Any] = {"sets": sets, "cannot_show": LIMITS_OF_DATA}
-    if len(motions) < 2:
-        return content
-    moved = shifts(*motions)
-    motors: dict[str, Any] = {}
-    for shift in moved:
-        one, two = (next(t for t in of_set if t.motor == shift.motor) for of_set in followed)
-        entry: dict[str, Any] = {"unit": shift.unit, "doubt": shift.doubt}
-        entry["start"] = asdict(shift.start) if shift.start else None
-        for key in _FIGURES:
-            first, second = getattr(one, key), getattr(two, key)
-            entry[key] = asdict(second.minus(first)) if first and second else None
-        motors[shift.motor] = entry
-    if gripper is not None:
-        figures = {s.motor: s.start.value for s in moved if s.start and s.unit == "deg"}
-        for name, cost in costs_at(gripper, poses_of(motions[0], gripper), figures).items():
-            motors[name]["start_mm"] = cost
-    return {**content, "between": {"motors": motors, "findings": shift_findings(moved, *motions)}}
-
-
-def document(content: Mapping[str, Any], command: str) -> Document:
-    """The tables, what was found, and what the data cannot say."""
-    names = " and ".join(Path(folder).name for folder in content["data"])
-    first, *others = _sentences(content)
-    sections = [
-        Section("State against command", parts=_tables(content), name="tables", level="always"),
-        Section("How to reproduce this", parts=[Code(command)], name="reproduce"),
-    ]
-    return Document(f"Leader and follower: {names}", first, sections, summary=others, data=content)
-
-
-def _content(motion: Motion, followed: Sequence[Tracking], gripper: Gripper | None) -> dict[str, Any]:
+def compare_content(motion: Motion, gripper: Gripper | None) -> dict[str, Any]:
+    """Everything that a data set says of its motors, and what it cannot say."""
+    followed = trackings(motion, gravity_of(gripper, motion.motors) if gripper else None)
     content: dict[str, Any] = {
         "frames": motion.frames,
         "of_frames": motion.of,
-        "episodes": len(motion.starts),
+        "episodes": len({stretch.episode for stretch in motion.stretches}),
         "motors": {t.motor: asdict(t) for t in followed},
         "findings": [*copy_findings(motion), *findings_of(followed)],
+        "cannot_show": LIMITS_OF_DATA,
     }
-    if gripper is None:
-        return content
-    angles, (at_rest, moving) = poses_of(motion, gripper), gripper_error(motion, followed, gripper)
-    content["gripper_mm"] = {"at_rest": asdict(at_rest) if at_rest else None, "moving": asdict(moving)}
-    for key in ("offset", "backlash"):
-        figures = {t.motor: figure.value for t in followed if t.unit == "deg" and (figure := getattr(t, key))}
-        for name, cost in costs_at(gripper, angles, figures).items():
-            content["motors"][name][f"{key}_mm"] = cost
+    if gripper is not None:
+        at_rest = error_at_rest(motion, followed, gripper)
+        content["gripper_at_rest_mm"] = asdict(at_rest) if at_rest else None
     return content
 
 
-def _tables(content: Mapping[str, Any]) -> list[Table]:
-    tables: list[Table] = []
-    for folder, of_set in zip(content["data"], content["sets"], strict=True):
-        name, motors = Path(folder).name, of_set["motors"]
-        rows = [[motor, *_followed(entry), _shown(entry["delay_s"], 1000, 0)] for motor, entry in motors.items()]
-        caption = f"State against command, 95 % intervals: {name}"
-        headings = ("motor", "unit", "gain", "offset", "backlash", "delay, ms")
-        tables.append(Table(caption, headings, rows, left=("unit",)))
-        loaded = {motor: entry for motor, entry in motors.items() if entry["load"] or "offset_mm" in entry}
-        rows = [
-            [motor, _shown(entry["load"], 1, 2), *(_mm(entry.get(f"{key}_mm")) for key in ("offset", "backlash"))]
-            for motor, entry in loaded.items()
-        ]
-        if rows:
-            at_gripper = ("motor", "deg per N m", "offset, mm", "backlash, mm")
-            tables.append(Table(f"By gravity, and at the gripper: {name}", at_gripper, rows))
-    if "between" in content:
-        motors = content["between"]["motors"]
-        rows = [
-            [motor, entry["unit"], _shown(entry["start"], 1, 2), _mm(entry.get("start_mm")), *_followed(entry)[2:]]
-            for motor, entry in motors.items()
-        ]
-        shown = ("motor", "unit", "begins", "mm", "offset", "backlash")
-        tables.append(Table("The second data set less the first", shown, rows, left=("unit",)))
-    return tables
-
-
-def _followed(entry: Mapping[str, Any]) -> list[str]:
-    return [entry["unit"], _shown(entry["gain"], 1, 3), *(_shown(entry[key], 1, 2) for key in ("offset", "backlash"))]
-
-
-def _sentences(content: Mapping[str, Any]) -> list[str]:
-    texts = []
-    for folder, of_set in zip(content["data"], content["sets"], strict=True):
-        name = Path(folder).name
-        texts += [f"{name}: {text}" for text in of_set["findings"]]
-        if (error := of_set.get("gripper_mm")) is not None:
-            rest, moving = error["at_rest"], error["moving"]
-            sizes = f"{rest['typical_mm']:.1f} mm typically and {rest['largest_mm']:.1f} mm at most" if rest else ""
-            texts.append(
-                f"{name}: the gripper is off its command by {sizes or 'an unknown distance'} at rest, by "
-                f"{moving['typical_mm']:.1f} mm and {moving['largest_mm']:.1f} mm over all frames, where it trails."
-            )
-        for motor, entry in of_set["motors"].items():
-            texts += [f"{name}: {motor}: {doubt}." for doubt in entry["doubts"]]
-        if of_set["frames"] < of_set["of_frames"]:
-            used = f"{of_set['frames']} of {of_set['of_frames']} frames"
-            texts.append(f"{name}: {used} were used, of episodes evenly chosen.")
-    between = content.get("between", {"findings": [], "motors": {}})
-    texts += between["findings"]
-    texts += [f"{motor}: {entry['doubt']}." for motor, entry in between["motors"].items() if entry["doubt"]]
-    return [*texts, content["cannot_show"]]
+def document(content: Mapping[str, Any]) -> Document:
+    """A row a motor, what is wrong, and what the data cannot say."""
+    motors = content["motors"]
+    rows = [
+        [motor + ", %" * (entry["unit"] == "%"), *(_shown(entry[key], *as_shown) for key, *as_shown in _COLUMNS)]
+        for motor, entry in motors.items()
+    ]
+    headings = ("motor", "gain", "offset", "backlash", "delay, ms")
+    table = Table("State against command (deg, or %), 95 % intervals", headings, rows)
+    texts = list(content["findings"])
+    if at_rest := content.get("gripper_at_rest_mm"):
+        typical, most = at_rest["typical_mm"], at_rest["largest_mm"]
+        texts.append(f"At rest the gripper is {typical:.1f} mm off its command typically, {most:.1f} mm at most.")
+    sagging = {
+        motor: load for motor, entry in motors.items() if (load := entry["load"]) and load["low"] * load["high"] > 0
+    }
+    texts += [f"{motor} gives way to gravity by {_shown(load, 1, 2)} deg per N m." for motor, load in sagging.items()]
+    texts += [f"{motor}: {doubt}." for motor, entry in motors.items() for doubt in entry["doubts"]]
+    if content["frames"] < content["of_frames"]:
+        texts.append(f"{content['frames']} of {content['of_frames']} frames were used, of episodes evenly chosen.")
+    texts.append(content["cannot_show"])
+    headline = f"Leader and follower: {Path(content['data']).name}"
+    return Document(headline, headline, [Section("", parts=[table], level="always")], summary=texts, data=content)
 
 
 def _shown(figure: Mapping[str, float] | None, factor: float, decimals: int) -> str:
@@ -566,7 +425,3 @@ def _shown(figure: Mapping[str, float] | None, factor: float, decimals: int) -> 
         return "-"
     half = (figure["high"] - figure["low"]) / 2 * factor
     return f"{figure['value'] * factor:.{decimals}f} ±{half:.{decimals}f}"
-
-
-def _mm(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"

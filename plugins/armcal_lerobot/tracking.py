@@ -24,7 +24,6 @@ from armcal_lerobot.motor_file import MotorFile, Units, is_gripper
 from armcal_lerobot.recordings import ACTION, STATE, Frames, Recording
 
 MOST_FRAMES = 100_000  # Of a larger data set every second, third, ... episode is taken, so that memory stays bounded.
-_START_FRAMES = 5
 _FEWEST = 10
 _MOST_PERCENT = 105.0
 _RADIANS_MOVED = 0.5
@@ -50,18 +49,6 @@ class Motion:
     stretches: tuple[Stretch, ...]  # without gaps
     frames: int  # how many were taken
     of: int  # how many there are
-
-    @property
-    def starts(self) -> Array:
-        first: dict[int, Array] = {}
-        for stretch in self.stretches:
-            first.setdefault(stretch.episode, np.median(stretch.reached[:_START_FRAMES], axis=0))
-        return np.array(list(first.values()))
-
-    def reached_degrees(self) -> dict[str, Array]:
-        """States (N) of every motor, deg; of a gripper in percent as they are."""
-        states = np.concatenate([stretch.reached for stretch in self.stretches])
-        return {name: states[:, i] for i, name in enumerate(self.motors)}
 
 
 def read_motion(recording: Recording, units: Units, file: MotorFile | None) -> Motion:
@@ -183,11 +170,6 @@ class Figure:
     def no_finer(self, half: float) -> Figure:
         return Figure(self.value, min(self.low, self.value - half), max(self.high, self.value + half))
 
-    def minus(self, other: Figure) -> Figure:
-        half = float(np.hypot(self.high - self.low, other.high - other.low)) / 2
-        middle = self.value - other.value
-        return Figure(middle, middle - half, middle + half)
-
 
 @dataclass(frozen=True)
 class Tracking:
@@ -201,7 +183,6 @@ class Tracking:
     offset: Figure | None = None  # of the state at rest, in the middle of the motion
     backlash: Figure | None = None  # by how much the command has to come back before the state does
     load: Figure | None = None  # per N m of gravity about the joint
-    load_most: float | None = None  # the largest error by gravity in these poses
     doubts: tuple[str, ...] = ()  # sentences
 
 
@@ -322,8 +303,6 @@ def _at_rest(motion: Motion, index: int, known: Tracking, torque: Torque | None,
             doubts.append(f"it comes to rest {visits[1]} times from below and {visits[0]} from above: no backlash")
     if np.isfinite(load).all() and np.ptp(load) > _LEAST_TORQUE and "gain" in columns:
         columns["load"] = load - load.mean()
-    elif np.isfinite(load).all():
-        doubts.append("gravity about it hardly changes in these poses")
     target = state - (middle if "gain" in columns else command)
     matrix = np.column_stack(list(columns.values()))
     free = _unobstructed(matrix, target)
@@ -334,13 +313,13 @@ def _at_rest(motion: Motion, index: int, known: Tracking, torque: Torque | None,
     if fit is None:
         return replace(known, doubts=(*doubts, "too few separate rests for intervals: record more episodes"))
     figures = dict(zip(columns, fit, strict=True))
-    gain, load_figure, backlash = figures.get("gain"), figures.get("load"), figures.get("backlash")
+    gain, backlash = figures.get("gain"), figures.get("backlash")
     if backlash is not None and gain is not None and abs(gain.value) > _LEAST_GAIN:
         backlash = backlash.times(1 / gain.value).plus(width).no_finer(_THIRD_OF_A_COUNT)
     gain = gain.no_finer(_FINEST_GAIN) if gain else None
-    most = abs(load_figure.value) * float(np.abs(load).max()) if load_figure else None
-    known = replace(known, gain=gain, offset=figures["offset"], backlash=backlash, load=load_figure)
-    return replace(known, load_most=most, doubts=tuple(doubts))
+    return replace(
+        known, gain=gain, offset=figures["offset"], backlash=backlash, load=figures.get("load"), doubts=tuple(doubts)
+    )
 
 
 def _slow_rows(
