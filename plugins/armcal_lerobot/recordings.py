@@ -1,52 +1,46 @@
-"""LeRobot's data sets, v2.1 (a parquet file an episode) and v3 (many episodes a file), read a batch at a time."""
+"""LeRobot's data sets, v2.1 and v3, read a stretch of frames at a time; and where the arm stood at rest in them, as
+records to calibrate from, with a camera's images of these moments.
+"""
 
-from __future__ import annotations
-
-import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.errors import DataError, Location
-from armcal.io.plain_files import input_bytes, text_of
+from armcal.errors import DataError, InputError, Location
+from armcal.io.cells import csv_text
+from armcal.io.plain_files import write_over
+from armcal.measure.rests import StillSettings, rests
 from armcal.plugins import library
-from numpy.typing import NDArray
 
-from armcal_lerobot.motor_file import read_json
+from armcal_lerobot.arm import wiring_of
+from armcal_lerobot.motor_file import MotorFile, Units, is_gripper, read_json, require_motors
 
 STATE, ACTION = "observation.state", "action"
-_NUMBERS = ("timestamp", "episode_index", "frame_index")
-_VECTOR_TYPES = ("float32", "float64", "int64", "int32")
+_NUMBERS = ("episode_index", "frame_index", "timestamp")
 _MAX_META = 64 << 20
 _ROWS_AT_ONCE = 4096
-_MOST_NUMBERS = 1000
-_EPISODE_FILE = re.compile(r"episode_(\d+)\.parquet")
-_KNOWN = ("v2.0", "v2.1", "v3.")
-_RECORD_AGAIN = "Take the file again from where it was recorded."
+_VERSIONS = ("v2.0", "v2.1", "v3.")
+_WHOLE = "Take it whole from where it was recorded."
+_MOST_PERCENT = 105.0
+_FEWEST = 10
+REVERSAL = 0.35  # deg or %: a command that comes back by less has not reversed; a servo's count is 0.09 deg
+_RADIANS_MOVED = 0.5  # An arm whose joints all stay within pi, and that moves by so much: in degrees it hardly moves
 
 
 @dataclass(frozen=True)
-class Frames:
-    """Some frames in a row: their file, episode (N), frame in it (N), time (N, s), vectors (N x size) by feature."""
+class Stretch:
+    """Frames of one episode without a gap: place in it (N), time (N, s), commands and states (N x motors; deg or %)."""
 
-    file: Path
-    episode: NDArray[np.int64]
-    frame: NDArray[np.int64]
+    episode: int
+    frame: Array
     time: Array
-    vectors: Mapping[str, Array]
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def chosen(self, which: Any) -> Frames:
-        """Those of a slice or an index."""
-        vectors = {name: values[which] for name, values in self.vectors.items()}
-        return Frames(self.file, self.episode[which], self.frame[which], self.time[which], vectors)
+    commanded: Array
+    reached: Array
 
 
 @dataclass(frozen=True)
@@ -57,229 +51,238 @@ class Recording:
     version: str  # as stated, such as v2.1
     fps: float  # frames a second
     frames: int  # how many ``meta/info.json`` states
-    names: Mapping[str, tuple[str, ...]]  # of the numbers of each vector feature, such as the motors
-    files: tuple[Path, ...]  # parquet files in their order
-    lengths: Mapping[int, int] = field(default_factory=dict)  # frames by episode, as far as the meta data state them
+    motors: tuple[str, ...]  # in the order of the numbers
+    stored: Units  # what the numbers are; the gripper's are always percent
+    file: MotorFile | None  # the follower's calibration, by which percent become degrees
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of each motor's numbers in the stretches: deg, or % where degrees are not known."""
+        is_percent = self.stored == "percent" and self.file is None
+        return tuple("%" if is_percent or is_gripper(motor) else "deg" for motor in self.motors)
 
     @cached_property
-    def motors(self) -> tuple[str, ...]:
-        """The motors of the state, which those of the action must be too.
+    def motion(self) -> tuple[Stretch, ...]:
+        """All stretches of ten frames and more."""
+        stretches = tuple(stretch for stretch in self.stretches() if len(stretch.frame) >= _FEWEST)
+        if not stretches:
+            text = f"found no {_FEWEST} frames in a row of one episode."
+            raise DataError(text, where=Location(str(self.folder)), hint="Record episodes without gaps.")
+        return stretches
+
+    def stretches(self) -> Iterator[Stretch]:
+        """All of them in order; one is in memory at a time.
 
         Raises:
-            DataError: the two differ.
+            DataError: a file is damaged or cut off, frames are missing, or the numbers have another unit.
+            InputError: the calibration lacks a motor.
         """
-        state, action = (tuple(motor_name(name) for name in self.names[part]) for part in (STATE, ACTION))
-        if state != action:
-            text = f"found {', '.join(action)} in {ACTION} and {', '.join(state)} in {STATE}, expected the same motors."
-            raise DataError(
-                text, where=_info(self.folder), hint="Only joint actions can be compared with joint states."
+        size = len(self.motors)
+        scale = np.ones(size)
+        if self.file is not None:
+            require_motors(self.file, self.motors)
+            degrees = [self.file.motors[motor].degrees_in(self.stored) for motor in self.motors]
+            scale = np.where([is_gripper(motor) for motor in self.motors], 1.0, degrees)
+        for (episode, _), parts in groupby(self._pieces(), key=lambda piece: (piece[0, 1], piece[0, 0])):
+            rows = np.concatenate(list(parts))
+            commanded, reached = rows[:, 4 : 4 + size] * scale, rows[:, 4 + size :] * scale
+            yield Stretch(int(episode), rows[:, 2], rows[:, 3], commanded, reached)
+
+    def _pieces(self) -> Iterator[Array]:
+        """Frames as stored, in pieces without a gap (N x (4 + 2 motors)): how far their place in the episode is behind
+        that in the data set, episode, place, time, commands and states.
+        """
+        size = len(self.motors)
+        widths = {**dict.fromkeys(_NUMBERS, 1), ACTION: size, STATE: size}
+        frames, low, high = 0, np.full(size, np.inf), np.full(size, -np.inf)
+        for path, batch in _batches(sorted((self.folder / "data").glob("chunk-*/*.parquet")), widths):
+            columns = [_numbers(path, batch, name, width) for name, width in widths.items()]
+            behind, state = np.arange(frames, frames + batch.num_rows)[:, None] - columns[1], columns[-1]
+            low, high = np.minimum(low, state.min(axis=0)), np.maximum(high, state.max(axis=0))
+            if self.stored == "percent" and np.abs(state).max() > _MOST_PERCENT:
+                text = f"found {np.abs(state).max():.1f}, expected percent."
+                hint = "Its numbers are degrees: leave --units percent out."
+                raise DataError(text, where=Location(str(path), field=STATE), hint=hint)
+            frames += batch.num_rows
+            rows = np.hstack([behind, *columns])
+            yield from np.split(rows, np.flatnonzero(np.diff(rows[:, :2], axis=0).any(axis=1)) + 1)
+        if frames != self.frames:
+            text = f"found {frames} frames, expected {self.frames} (meta/info.json)."
+            raise DataError(text, where=Location(str(self.folder / "data")), hint=_WHOLE)
+        ends = np.array([low, high])[:, [not is_gripper(name) for name in self.motors]]
+        if self.stored == "degrees" and np.ptp(ends, axis=0).max() > _RADIANS_MOVED and np.abs(ends).max() <= np.pi:
+            text = (
+                f"found {ends.min():.2f} to {ends.max():.2f} in all joints, expected degrees: they look like radians."
             )
-        twice = next((name for name in state if state.count(name) > 1), None)
-        if twice is not None:
-            text = f"found the motor {twice!r} twice, expected it once."
-            raise DataError(text, where=_info(self.folder), hint="Correct the names of the features.")
-        return state
+            hint = "Multiply joint states and actions by 57.29578, as LeRobot records degrees or percent."
+            raise DataError(text, where=Location(str(self.folder), field=STATE), hint=hint)
 
     def video(self, camera: str, episode: int) -> tuple[Path, int]:
-        """A camera's video of an episode, and the frame in it at which the episode begins.
-
-        Raises:
-            DataError: there is no such video.
-        """
-        videos = self.folder / "videos"
-        if self.version.startswith("v2"):
-            there = sorted(videos.glob(f"chunk-*/{camera}/episode_{episode:06d}.mp4"))
-            path, first = (there[0] if there else videos / camera), 0
-        else:
-            path, first = self._part_of_video(camera, episode)
+        """A camera's video of an episode, and the frame in it at which the episode begins."""
+        videos, first = self.folder / "videos", 0
+        path = next(videos.glob(f"chunk-*/{camera}/episode_{episode:06d}.mp4"), videos / camera)
+        if self.version.startswith("v3"):
+            columns = tuple(f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
+            tables = sorted((self.folder / "meta" / "episodes").glob("chunk-*/*.parquet"))
+            for _, batch in _batches(tables, ("episode_index", *columns)):
+                numbers = batch.column("episode_index").to_pylist()
+                if episode in numbers:
+                    chunk, file, start = (batch.column(name)[numbers.index(episode)].as_py() for name in columns)
+                    path = videos / camera / f"chunk-{int(chunk):03d}" / f"file-{int(file):03d}.mp4"
+                    first = round(float(start) * self.fps)
         if not path.is_file():
-            shown = ", ".join(sorted({str(file.parent.relative_to(videos)) for file in videos.rglob("*.mp4")}))
-            text = f"found no video of {camera}, episode {episode}; found {shown[:200] or 'none'}."
-            raise DataError(text, where=Location(str(path)), hint="Name a camera of the data set, or take its videos.")
+            hint = "Name a camera of the data set, or take its videos too."
+            raise DataError(f"found no video of {camera}, episode {episode}.", where=Location(str(path)), hint=hint)
         return path, first
 
-    def _part_of_video(self, camera: str, episode: int) -> tuple[Path, int]:
-        """Of v3, where a file holds many episodes."""
-        columns = tuple(f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
-        for path in sorted((self.folder / "meta" / "episodes").glob("chunk-*/*.parquet")):
-            for batch in _batches(path, ("episode_index", *columns)):
-                episodes = batch.column("episode_index").to_pylist()
-                if episode in episodes:
-                    chunk, file, start = (batch.column(name)[episodes.index(episode)].as_py() for name in columns)
-                    place = self.folder / "videos" / camera / f"chunk-{int(chunk):03d}" / f"file-{int(file):03d}.mp4"
-                    return place, round(float(start) * self.fps)
-        return self.folder / "videos" / camera, 0
 
-    def read(self, features: Sequence[str]) -> Iterator[Frames]:
-        """All frames, at most 4096 at a time, none of two files.
-
-        Raises:
-            DataError: a file is damaged or cut off, a column is missing, or a vector has another length.
-        """
-        counted: dict[int, int] = {}
-        for file in self.files:
-            done = 0
-            for batch in _batches(file, (*_NUMBERS, *features)):
-                numbers = {name: _numbers(batch.column(name), file, name, done) for name in _NUMBERS}
-                sizes = {name: len(self.names[name]) for name in features}
-                vectors = {name: _vectors(batch.column(name), file, name, sizes[name], done) for name in features}
-                done += batch.num_rows
-                if not batch.num_rows:
-                    continue
-                episode, frame = (numbers[name].astype(np.int64) for name in _NUMBERS[1:])
-                for one, count in zip(*(part.tolist() for part in np.unique(episode, return_counts=True)), strict=True):
-                    counted[one] = counted.get(one, 0) + count
-                yield Frames(file, episode, frame, numbers["timestamp"], vectors)
-        for one, length in self.lengths.items():
-            if counted.get(one, 0) != length:
-                text = f"found {counted.get(one, 0)} frames of episode {one}, expected {length} (its meta data)."
-                raise DataError(text, where=Location(str(self.folder / "data")), hint=_RECORD_AGAIN)
-
-
-def open_recording(folder: Path) -> Recording:
-    """A data set's meta data and files.
-
-    Raises:
-        DataError: it is no data set of LeRobot, of a version that is not known, or files are missing.
-        PluginError: pyarrow is not installed.
-    """
-    where = _info(folder)
-    if not folder.is_dir():
-        hint = "Give the folder that holds meta and data."
-        raise DataError("it is no folder, expected a LeRobot data set.", where=Location(str(folder)), hint=hint)
-    _, info = read_json(folder / "meta" / "info.json", _MAX_META, "a LeRobot data set's meta/info.json", _RECORD_AGAIN)
-    if not isinstance(info, dict):
-        raise DataError("found no object.", where=where, hint=_RECORD_AGAIN)
-    version = str(info.get("codebase_version", ""))
-    if not version.startswith(_KNOWN):
-        text = f"found codebase_version {version[:20]!r}, expected v2.1 or v3.0."
+def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | None = None) -> Recording:
+    path = folder / "meta" / "info.json"
+    where = Location(str(path))
+    info = read_json(path, _MAX_META, "a LeRobot data set's meta/info.json", "Give the folder with meta and data.")[1]
+    info = info if isinstance(info, dict) else {}
+    version, fps, frames = (info.get(key) for key in ("codebase_version", "fps", "total_frames"))
+    if not str(version).startswith(_VERSIONS):
+        text = f"found codebase_version {str(version)[:20]!r}, expected v2.1 or v3.0."
         raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
-    fps, frames = (info.get(key) for key in ("fps", "total_frames"))
     if not (isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 1 <= frames < 1 << 53):
-        text = f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1."
-        raise DataError(text, where=where, hint="Take it whole from where it was recorded.")
-    names = _vector_names(info, where)
-    files = tuple(sorted((folder / "data").glob("chunk-*/*.parquet")))
-    if not files:
-        text = "found no file data/chunk-*/*.parquet."
-        raise DataError(text, where=Location(str(folder)), hint="Give the folder that holds meta and data.")
-    lengths = _lengths_of_lines(folder, files) if version.startswith("v2") else _lengths_of_tables(folder)
-    return Recording(folder, version, float(fps), frames, names, files, lengths)
-
-
-def motor_name(name: str) -> str:
-    """A motor by the name of its number: ``shoulder_pan.pos`` and ``main_shoulder_pan`` are shoulder_pan."""
-    return name.removesuffix(".pos").removeprefix("main_")
-
-
-def _vector_names(info: Mapping[str, Any], where: Location) -> dict[str, tuple[str, ...]]:
-    features = info.get("features")
-    if not isinstance(features, dict):
-        raise DataError("found no features.", where=where, hint="Take it whole from where it was recorded.")
-    names = {}
-    for feature, about in features.items():
-        about = about if isinstance(about, dict) else {}
-        shape, stated = about.get("shape"), about.get("names")
-        if str(about.get("dtype")) not in _VECTOR_TYPES or not isinstance(shape, list) or len(shape) != 1:
-            continue
-        if type(shape[0]) is not int or not 1 <= shape[0] <= _MOST_NUMBERS:
-            continue
-        listed = next(iter(stated.values()), None) if isinstance(stated, dict) else stated
-        listed = listed if isinstance(listed, list) and len(listed) == shape[0] else range(shape[0])
-        names[feature] = tuple(map(str, listed))
+        raise DataError(
+            f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1.", where=where, hint=_WHOLE
+        )
+    motors = []
     for feature in (STATE, ACTION):
-        if feature not in names:
-            shown = ", ".join(features) or "none"
-            text = f"found no feature {feature}, expected it as a vector of numbers; found {shown[:200]}."
-            raise DataError(text, where=where, hint="Only data sets of arms whose joints were recorded can be used.")
-    return names
+        features = info.get("features")
+        about = features.get(feature) if isinstance(features, dict) else None
+        names = about.get("names") if isinstance(about, dict) else None
+        names = next(iter(names.values()), None) if isinstance(names, dict) else names
+        if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+            hint = "Only data sets of arms whose joints were recorded can be used."
+            raise DataError(f"found no feature {feature} with the names of motors.", where=where, hint=hint)
+        # shoulder_pan.pos and main_shoulder_pan are shoulder_pan.
+        motors.append(tuple(name.removesuffix(".pos").removeprefix("main_") for name in names))
+    state, action = motors
+    if state != action:
+        text = f"found {', '.join(action)} in {ACTION} and {', '.join(state)} in {STATE}, expected the same motors."
+        raise DataError(text, where=where, hint="Only joint actions can be compared with joint states.")
+    return Recording(folder, str(version), float(fps), frames, state, stored, file)
 
 
-def _lengths_of_lines(folder: Path, files: Sequence[Path]) -> dict[int, int]:
-    """Of v2: frames by episode; each must have its file."""
-    path = folder / "meta" / "episodes.jsonl"
-    lengths: dict[int, int] = {}
-    lines = text_of(input_bytes(path, _MAX_META, "a list of episodes"), path, "Save it as UTF-8.").splitlines()
-    for number, line in enumerate(lines, start=1):
-        try:
-            entry = json.loads(line) if line.strip() else None
-            if entry is not None:
-                lengths[int(entry["episode_index"])] = int(entry["length"])
-        except (ValueError, KeyError, TypeError, OverflowError) as fault:
-            text = "found a line without episode_index and length."
-            raise DataError(text, where=Location(str(path), line=number), hint=_RECORD_AGAIN) from fault
-    there = {int(match[1]) for file in files if (match := _EPISODE_FILE.fullmatch(file.name))}
-    missing = [episode for episode in lengths if episode not in there]
-    if missing:
-        shown = ", ".join(f"episode_{episode:06d}.parquet" for episode in missing[:3])
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        text = f"found no file {shown}{more}, expected one for each line of meta/episodes.jsonl."
-        raise DataError(text, where=Location(str(folder / "data")), hint=_RECORD_AGAIN)
-    return lengths
-
-
-def _lengths_of_tables(folder: Path) -> dict[int, int]:
-    lengths: dict[int, int] = {}
-    for path in sorted((folder / "meta" / "episodes").glob("chunk-*/*.parquet")):
-        for batch in _batches(path, ("episode_index", "length")):
-            columns = (batch.column(name).to_pylist() for name in ("episode_index", "length"))
-            lengths.update(zip(*columns, strict=True))
-    return lengths
-
-
-def _batches(file: Path, columns: Sequence[str]) -> Iterator[Any]:
-    """Rows of a parquet file, some at a time; what the library raises of a damaged one is a DataError with the file."""
+def _batches(paths: Iterable[Path], columns: Collection[str]) -> Iterator[tuple[Path, Any]]:
+    """Rows of parquet files, some at a time; what the library raises of a damaged one is a DataError with the file."""
     parquet = library("pyarrow.parquet", "reading LeRobot's data sets")
+    for path in paths:
+        try:
+            with parquet.ParquetFile(path, memory_map=True) as table:
+                there = table.schema_arrow.names
+                for column in columns:
+                    if column not in there:
+                        text = f"found no column {column}; found {', '.join(there)[:200]}."
+                        raise DataError(text, where=Location(str(path), field=column), hint=_WHOLE)
+                some = table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
+                yield from ((path, batch) for batch in some if batch.num_rows)
+        except (OSError, ValueError, KeyError) as fault:  # pyarrow's own errors derive from these
+            reason = (str(fault) or type(fault).__name__).splitlines()[0][:120]
+            raise DataError(f"it is damaged or cut off ({reason}).", where=Location(str(path)), hint=_WHOLE) from fault
+
+
+def _numbers(path: Path, batch: Any, name: str, width: int) -> Array:
+    """A column of numbers, or of lists of numbers (N x width)."""
     try:
-        with parquet.ParquetFile(file, memory_map=True) as table:
-            there = table.schema_arrow.names
-            for column in columns:
-                if column not in there:
-                    hint = "Record the data set again, or take out this file."
-                    _refuse(file, column, f"found no column {column}; found {', '.join(there)[:200]}.", hint)
-            yield from table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
-    except (OSError, ValueError, KeyError) as fault:  # pyarrow's own errors derive from these
-        text = f"it is damaged or cut off ({str(fault).splitlines()[0][:120] if str(fault) else type(fault).__name__})."
-        raise DataError(text, where=Location(str(file)), hint=_RECORD_AGAIN) from fault
-
-
-def _numbers(column: Any, file: Path, name: str, done: int) -> Array:
-    values = column.to_numpy(zero_copy_only=False)
-    if values.dtype.kind not in "fiu":
-        _refuse(file, name, f"found {column.type}, expected numbers.", _RECORD_AGAIN)
-    _require_finite(np.asarray(values, dtype=float), file, name, done)
-    return np.asarray(values, dtype=float)
-
-
-def _vectors(column: Any, file: Path, name: str, size: int, done: int) -> Array:
-    """A column of lists (N x size)."""
-    if column.null_count:
-        row = int(np.argmax(column.is_null().to_numpy(zero_copy_only=False)))
-        _refuse(file, name, "found nothing, expected a vector.", _RECORD_AGAIN, done + row + 1)
-    if size == 1 and not hasattr(column, "flatten"):
-        return _numbers(column, file, name, done)[:, None]
-    if not hasattr(column.type, "value_type"):
-        _refuse(file, name, f"found {column.type}, expected a list of {size} numbers.", _RECORD_AGAIN)
-    lengths = np.asarray(column.value_lengths().to_numpy(zero_copy_only=False), dtype=float)
-    wrong = np.flatnonzero(lengths != size)
-    if len(wrong):
-        text = f"found {lengths[wrong[0]]:.0f} numbers, expected {size} as in meta/info.json."
-        _refuse(file, name, text, _RECORD_AGAIN, done + int(wrong[0]) + 1)
-    values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=float).reshape(-1, size)
-    _require_finite(values, file, name, done)
+        values = np.array(batch.column(name).to_pylist(), dtype=float).reshape(batch.num_rows, width)
+    except (TypeError, ValueError):
+        values = np.full((1, 1), np.nan)
+    if not np.isfinite(values).all():
+        text = f"found a row that does not hold finite numbers, expected {width} in each (meta/info.json)."
+        raise DataError(text, where=Location(str(path), field=name), hint="Leave that episode out.")
     return values
 
 
-def _require_finite(values: Array, file: Path, name: str, done: int) -> None:
-    bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    if bad.any():
-        text = "found a number that is not finite."
-        _refuse(file, name, text, "Leave that episode out.", done + int(np.argmax(bad)) + 1)
+def sides(command: Array) -> tuple[Array, Array]:
+    """Which way a command moved last (N; -1, 1, or 0 before its first motion), and how far since it reversed."""
+    side, way = np.zeros(len(command)), np.zeros(len(command))
+    now, turned, extreme = 0.0, command[0], command[0]
+    for i, value in enumerate(command.tolist()):
+        if now == 0.0:
+            if abs(value - turned) > REVERSAL:
+                now, extreme = (1.0 if value > turned else -1.0), value
+        elif (value - extreme) * now > 0:
+            extreme = value
+        elif abs(value - extreme) > REVERSAL:
+            now, turned, extreme = -now, extreme, value
+        side[i], way[i] = now, abs(extreme - turned)
+    return side, way
 
 
-def _info(folder: Path) -> Location:
-    return Location(str(folder / "meta" / "info.json"))
+@dataclass(frozen=True)
+class RestRecord:
+    """A rest: its episode, its middle frame, the motors' mean angles (deg) and the sides they came from (-1, 0, 1)."""
+
+    episode: int
+    frame: int
+    degrees: Array  # of all motors but the gripper's
+    approach: Array
+
+    @property
+    def name(self) -> str:
+        return f"e{self.episode:06d}_f{self.frame:06d}"
 
 
-def _refuse(file: Path, column: str, message: str, hint: str, row: int | None = None) -> NoReturn:
-    raise DataError(message, where=Location(str(file), field=column, row=row), hint=hint)
+def records_of(recording: Recording, angles: str, window_s: float, spread_deg: float) -> list[RestRecord]:
+    """All rests of all episodes, in order: ``angles`` are those of the ``state``, or those of the ``action``."""
+    if "deg" not in recording.units:
+        raise InputError("found numbers in percent, expected degrees.", hint="Give --calibration FILE as well.")
+    turning = [not is_gripper(name) for name in recording.motors]
+    still = StillSettings.si(window=window_s, spread=np.radians(spread_deg))
+    records = []
+    for stretch in recording.stretches():
+        shown = (stretch.commanded if angles == "action" else stretch.reached)[:, turning]
+        approach = np.column_stack([sides(command)[0] for command in stretch.commanded[:, turning].T])
+        for rest in rests(np.radians(shown.T), [], stretch.time, still):
+            frame, mean = int(stretch.frame[(rest.start + rest.stop) // 2]), shown[rest.start : rest.stop].mean(axis=0)
+            records.append(RestRecord(stretch.episode, frame, mean, approach[rest.stop - 1]))
+    if not records:
+        text = f"found no {window_s:g} s in which no motor moved by more than {spread_deg:g} deg."
+        raise DataError(text, where=Location(str(recording.folder)), hint="Give another --window-s or --spread-deg.")
+    return records
+
+
+def write_records(
+    out: Path, motors: Sequence[str], records: Sequence[RestRecord], texts: Sequence[str], has_images: bool
+) -> None:
+    """Write a CSV: pose_id, angles and approaches of every joint but the gripper's, and the image's name."""
+    turning = [name for name in motors if not is_gripper(name)]
+    stated = {motor: joint.removeprefix("-") for motor, _, joint in (text.partition("=") for text in texts)}
+    wiring = wiring_of([stated.get(name, name) for name in turning], turning, texts)
+    columns = [(joint, turning.index(motor), sense) for joint, (motor, sense) in wiring.items()]
+    headings = [heading for joint, *_ in columns for heading in (f"{joint}_deg", f"approach_{joint}")]
+    rows: list[list[object]] = [["pose_id", *headings, *["image"] * has_images]]
+    for record in records:
+        row: list[object] = [record.name]
+        for _, place, sense in columns:
+            row += [float(sense * record.degrees[place]), int(sense * record.approach[place])]
+        rows.append([*row, *[f"{record.name}.png"] * has_images])
+    write_over({out: csv_text(rows, ".4f").encode()})
+
+
+def write_images(recording: Recording, camera: str, records: Sequence[RestRecord], folder: Path) -> None:
+    """Write a camera's image of each rest as PNG."""
+    cv2 = library("cv2", "reading videos")
+    by_video: dict[Path, list[tuple[int, RestRecord]]] = {}
+    for record in records:
+        path, first = recording.video(camera, record.episode)
+        by_video.setdefault(path, []).append((first + record.frame, record))
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, places in by_video.items():
+        capture, at = cv2.VideoCapture(str(path)), 0
+        try:
+            for place, record in sorted(places, key=lambda pair: pair[0]):
+                while at < place and capture.grab():
+                    at += 1
+                there, image = capture.read()
+                if not there:
+                    text = f"it ends or is damaged before frame {place}, expected an image there."
+                    raise DataError(text, where=Location(str(path)), hint="Take the video again, whole.")
+                at += 1
+                write_over({folder / f"{record.name}.png": cv2.imencode(".png", image)[1].tobytes()})
+        finally:
+            capture.release()

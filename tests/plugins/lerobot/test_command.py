@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from armcal.cli.main import cli
 from armcal.errors import ArmcalError, DataError, InputError
 from armcal.plugins import discover
+from armcal_lerobot.arm import Gripper, wiring_of
 from armcal_lerobot.command import lerobot
 from armcal_lerobot.motor_file import Motor
-from armcal_lerobot.rest_records import Gripper, wiring_of
 from armcal_servobus.joints import drivable
 from click.testing import CliRunner
 
@@ -48,7 +47,7 @@ def test_what_a_wrong_zero_costs(tmp_path: Path) -> None:
     content = json_of("check", one, two, "--arm", ARM)
     pan = content["motors"]["shoulder_pan"]
     assert pan["zero_moved_deg"] == pytest.approx(193 * 360 / 4096) and pan["teeth"] == 0
-    gripper = Gripper(Path(ARM), None, {}, discover())
+    gripper = Gripper(Path(ARM), None, list(motor_entries()), [], discover())
     motors = {name: Motor(name, **entry) for name, entry in motor_entries().items()}
     radius = np.linalg.norm(gripper.positions(gripper.poses(motors))[:2], axis=0)
     assert pan["mm_per_deg"]["largest_mm"] == pytest.approx(1000 * np.radians(1) * radius.max(), rel=1e-3)
@@ -57,24 +56,17 @@ def test_what_a_wrong_zero_costs(tmp_path: Path) -> None:
     assert "At the same command the gripper stands" in called("check", one, two, "--arm", ARM)
 
 
-def test_servos_that_were_exchanged_between_the_files_are_named(tmp_path: Path) -> None:
-    one, swapped = write_motors(tmp_path / "one.json"), {"shoulder_lift": {"id": 3}, "elbow_flex": {"id": 2}}
-    two = write_motors(tmp_path / "two.json", **swapped)
-    notes = json_of("check", one, two)["notes"]
-    assert "shoulder_lift has the id 2 in one.json and 3 in two.json" in notes[0] and len(notes) == 2
-
-
-def test_a_joint_without_a_motor_is_offered_the_nearest_that_is_free(tmp_path: Path) -> None:
+def test_a_joint_without_a_motor_is_named_with_the_motors_that_turn_none(tmp_path: Path) -> None:
     file = tmp_path / "one.json"
     entries = json.loads(write_motors(file).read_text())
     renamed = {name.replace("_", " "): entry for name, entry in entries.items()}
     file.write_text(json.dumps(renamed))
-    with pytest.raises(InputError, match="--joint 'shoulder pan=shoulder_pan'"):
+    with pytest.raises(InputError, match=r"no motor for the joint shoulder_pan; motors without a joint: shoulder pan,"):
         called("check", file, "--arm", ARM)
-    with pytest.raises(InputError, match="no motor called 'shoulder_pun' for the joint shoulder_pan"):
+    with pytest.raises(InputError, match=r"found --joint 'shoulder_pun=shoulder_pan', .*The motors are shoulder_pan,"):
         called("check", write_motors(tmp_path / "two.json"), "--arm", ARM, "--joint", "shoulder_pun=shoulder_pan")
     file.write_text(json.dumps({name: entry for name, entry in entries.items() if name != "elbow_flex"}))
-    with pytest.raises(InputError, match="None of them is without a joint"):
+    with pytest.raises(InputError, match="motors without a joint: none"):
         called("check", file, "--arm", ARM)
 
 
@@ -90,11 +82,9 @@ def test_a_range_in_percent_stretches_the_motion(tmp_path: Path) -> None:
 def test_sections_are_a_configuration(tmp_path: Path) -> None:
     one = write_motors(tmp_path / "one.json", elbow_flex={"range_min": 1000})
     text = called("joints", one, "--arm", ARM, "--joint", "elbow_flex=-elbow_flex")
-    sections = yaml.safe_load(text)
-    device = sections["bench"]["device"]
+    device = yaml.safe_load(text)["bench"]["device"]
     assert discover().find("device", device.pop("type")).load().Settings.model_validate(device)
-    joint = device["joints"]["arm.elbow_flex"]
-    assert joint == {
+    assert device["joints"]["arm.elbow_flex"] == {
         "id": 3,
         "model": "sts3215",
         "zero_count": 2092,
@@ -102,30 +92,20 @@ def test_sections_are_a_configuration(tmp_path: Path) -> None:
         "direction": -1,
         "range_deg": [-96.0, 95.9],
     }
-    assert sections["plan"]["limits"]["shoulder_pan"] == ["-100.0 deg", "99.9 deg"]
-    for name in ("skeleton.yaml", "arm.yaml"):
-        (tmp_path / name).write_bytes((CONFIGS / name).read_bytes())
-    path, parameters = tmp_path / "plan.yaml", {**sections["parameters"], "free": ["arm.zeros.offset*"]}
-    path.write_text("extends: arm.yaml\n" + yaml.safe_dump({"parameters": parameters, "plan": sections["plan"]}))
-    import armcal
-
-    assert armcal.Experiment.load(path).parameters["arm.zeros.offset3"].free
 
 
 def test_motors_of_any_name_give_sections_that_load(tmp_path: Path) -> None:
     name = "[odd]: 'motor"
     (tmp_path / "one.json").write_text(json.dumps({name: motor_entries()["elbow_flex"]}))
-    sections = yaml.safe_load(called("joints", tmp_path / "one.json"))
-    assert list(sections["bench"]["device"]["joints"]) == [f"arm.{name}"] and list(sections["plan"]["limits"]) == [name]
+    device = yaml.safe_load(called("joints", tmp_path / "one.json"))["bench"]["device"]
+    assert list(device["joints"]) == [f"arm.{name}"]
 
 
-def test_limits_of_the_arm_give_zeros_and_name_ranges_that_were_not_swept(tmp_path: Path) -> None:
+def test_ranges_that_were_not_swept_are_named_by_the_limits_of_the_arm(tmp_path: Path) -> None:
     config, joints = limited_arm(tmp_path, -1.0, 1.4)
     file, name = swept(tmp_path, joints, 2048 - 600, 2048 + 600), joints[0]  # 105 deg
     notes = " ".join(json_of("check", file, "--arm", config)["notes"])
     assert f"{name} has a range of 105 deg, and its joint one of 138 deg" in notes and "off by 16 deg" in notes
-    values = yaml.safe_load(called("joints", file, "--arm", config))["parameters"]["values"]
-    assert values["arm.zeros.offset1"] == "11.5 deg"
 
 
 def limited_arm(folder: Path, lower: float, upper: float, kind: str = "revolute") -> tuple[Path, list[str]]:
@@ -162,19 +142,18 @@ def test_a_range_of_which_the_encoder_passed_its_end_is_named_and_never_driven(
         called("joints", file)
 
 
-def test_sound_ranges_are_not_named_and_stay_within_the_model(tmp_path: Path) -> None:
+def test_sound_ranges_are_not_named(tmp_path: Path) -> None:
     """Of 200 files homed within 20 deg of the middle, with ranges up to 40 deg longer than the model's, none."""
     random = np.random.default_rng(0)
     for _ in range(200):
         middle, half = 2047 + random.uniform(-20, 20) * 4096 / 360, random.uniform(45, 120) * 4096 / 360
         motor = Motor("q", 1, 0, 0, round(middle - half), round(middle + half))
-        assert not motor.is_beyond(None) and not motor.is_beyond(2 * motor.half_range_deg - 40)
+        assert not motor.passed_end(None) and not motor.passed_end(motor.range_deg - 40)
     config, joints = limited_arm(tmp_path, -1.5, 1.5)
     file = swept(tmp_path, joints, 800, 3300)
     assert not json_of("check", file, "--arm", config)["notes"]
-    sections = yaml.safe_load(called("joints", file, "--arm", config))
-    assert sections["plan"]["limits"][joints[0]] == ["-85.9 deg", "85.9 deg"]
-    assert sections["bench"]["device"]["joints"][f"arm.{joints[0]}"]["range_deg"] == [-109.8, 109.8]
+    device = yaml.safe_load(called("joints", file, "--arm", config))["bench"]["device"]
+    assert device["joints"][f"arm.{joints[0]}"]["range_deg"] == [-109.8, 109.8]
 
 
 def test_a_whole_turn_is_sound_where_the_joint_turns_freely(tmp_path: Path) -> None:
@@ -185,41 +164,6 @@ def test_a_whole_turn_is_sound_where_the_joint_turns_freely(tmp_path: Path) -> N
     chosen = discover().find("device", device.pop("type")).load().Settings.model_validate(device)
     drivable(chosen.chosen(joints).values())
     assert not json_of("check", write_motors(tmp_path / "two.json"))["notes"]  # its wrist_roll is a whole turn
-
-
-def test_what_joints_writes_is_planned_and_accepted_by_acquire(tmp_path: Path) -> None:
-    """As it stands without a word; limits beyond the model's are told by both, however quiet they are to be."""
-    urdf, invoke = CONFIGS.parent / "ball" / "arm7.urdf", CliRunner().invoke
-    joints = re.findall(r'<joint name="([^"]+)" type="revolute"', urdf.read_text())
-    file, last = swept(tmp_path, joints, 800, 3300), joints[-1]
-    (tmp_path / "arm.urdf").write_bytes(urdf.read_bytes())
-    arm, tracker = {"model": {"type": "urdf", "path": "arm.urdf"}}, {"type": "tip_position", "noise_mm": 0.5}
-    (tmp_path / "arm.yaml").write_text(yaml.safe_dump({"arms": {"arm": arm}, "measurements": {"tracker": tracker}}))
-    entries = json.loads(file.read_text())
-    entries["wrist_roll"] = {**entries.pop(last), "range_min": 0, "range_max": 4095}
-    file.write_text(json.dumps(entries))
-    sections = yaml.safe_load(called("joints", file, "--arm", tmp_path / "arm.yaml", "--joint", f"wrist_roll={last}"))
-    sections["arms"] = {"arm": {"effects": {"zeros": {"type": "servo_map", "gains": "one"}}}}
-    sections["bench"] |= {"tracker": {"type": "dtrack", "port": 5000}, "bodies": {"base": "1", "tool": "2"}}
-    sections["parameters"]["free"] = ["arm.zeros.offset*"]
-    config, plan = tmp_path / "bench.yaml", str(tmp_path / "plan.csv")
-    quick = ["--set", "evaluator=interpreted", "--set", "plan.count=60", "--set", "plan.starts=1"]
-
-    def told() -> list[str]:
-        config.write_text(yaml.safe_dump({"extends": "arm.yaml", **sections}))
-        planned = invoke(cli, ["plan", str(config), "--poses", "6", "--out", plan, "-q", *quick])
-        driven = invoke(cli, ["acquire", str(config), "--plan", plan, "--dry-run", "-q"])
-        assert [planned.exit_code, driven.exit_code] == [0, 0], planned.output + driven.output
-        return [planned.output, driven.output]
-
-    assert told() == ["", ""]
-    sections["plan"]["limits"][joints[1]] = ["-168 deg", "100 deg"]
-    sections["bench"]["device"]["joints"][f"arm.{joints[1]}"] |= {"zero_count": 2048, "range_deg": [-168, 168]}
-    sections["bench"]["acquisition"] = {"limits": {last: ["-180 deg", "180 deg"]}}
-    by_plan, by_acquire = told()
-    text = f"limits of {joints[1]}, -168 to 100 deg, go beyond those of the arm's model, -114.6 to 114.6 deg"
-    assert text in by_plan and text in by_acquire
-    assert f"limits of {last}, -180 to 180 deg, go beyond those of the arm's model, -166.2 to 166.2" in by_acquire
 
 
 @pytest.mark.slow
@@ -246,7 +190,7 @@ def test_a_question_before_anything_is_written(
 ) -> None:
     path = write_motors(tmp_path / "arm.json")
     text = path.read_text()
-    monkeypatch.setattr("armcal_lerobot.command._agreed", lambda _: False)
+    monkeypatch.setattr("armcal_lerobot.command._is_agreed", lambda _: False)
     assert "nothing was written" in called("zeros", calibrated, path)
     assert path.read_text() == text
 
@@ -270,14 +214,20 @@ def test_a_data_set_is_compared(tmp_path: Path) -> None:
     ("texts", "message"),
     [
         (["a"], "expected MOTOR=JOINT"),
-        (["a=b", "a=c"], "twice"),
-        (["a=b", "c=-b"], "twice"),
+        (["a=b", "a=c"], "found a twice"),
+        (["a=b", "c=-b"], "found b twice"),
         (["a=-"], "expected MOTOR"),
     ],
 )
 def test_wiring_that_is_none_is_refused(texts: list[str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        wiring_of(texts)
+        wiring_of(["b", "c"], ["a", "c"], texts)
+
+
+def test_a_joint_that_keeps_its_zero_needs_no_motor() -> None:
+    assert wiring_of(["b"], ["a"], ["a=-b"], idle=["c"])["b"] == ("a", -1)
+    with pytest.raises(InputError, match="no motor for the joint c"):
+        wiring_of(["b", "c"], ["a"], ["a=-b"])
 
 
 def test_options_without_an_arm_are_refused(tmp_path: Path) -> None:
@@ -286,17 +236,17 @@ def test_options_without_an_arm_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"without --arm\."):
             called("check", path, *options)
     pytest.importorskip("pyarrow")
-    with pytest.raises(ArmcalError, match="expected a LeRobot data set"):
-        called("compare", path)
+    with pytest.raises(ArmcalError, match=r"meta/info\.json: there is no such file"):
+        called("compare", path.parent)
 
 
 def test_joints_without_a_motor_are_named(tmp_path: Path) -> None:
     path = write_motors(tmp_path / "arm.json")
     path.write_text(path.read_text().replace("wrist_roll", "roll"))
-    with pytest.raises(ArmcalError, match=r"found no motor for the joint wrist_roll.*--joint roll=wrist_roll"):
+    with pytest.raises(ArmcalError, match=r"found no motor for the joint wrist_roll.*without a joint: roll\."):
         called("check", path, "--arm", ARM)
     assert "roll" in called("check", path, "--arm", ARM, "--joint", "roll=-wrist_roll")
-    with pytest.raises(ArmcalError, match="found no joint 'q9'"):
+    with pytest.raises(ArmcalError, match="found --joint 'roll=q9'"):
         called("check", path, "--arm", ARM, "--joint", "roll=q9")
 
 
@@ -311,7 +261,7 @@ def test_zeros_are_written_once(tmp_path: Path, calibrated: Path) -> None:
 
 def test_zeros_of_a_misspelt_joint_are_refused(tmp_path: Path, calibrated: Path) -> None:
     path = write_motors(tmp_path / "arm.json")
-    with pytest.raises(InputError, match="no joint 'elbow'"):
+    with pytest.raises(InputError, match="found --joint 'elbow_flex=-elbow'"):
         called("zeros", calibrated, path, "--joint", "elbow_flex=-elbow", "--yes")
     with pytest.raises(InputError, match="found shoulder_pan twice"):
         called("zeros", calibrated, path, "--joint", "shoulder_pan=elbow_flex", "--yes")
@@ -323,7 +273,7 @@ def test_states_that_were_copied_from_commands_are_named(tmp_path: Path) -> None
     pytest.importorskip("pyarrow")
     made = episodes({}, count=2, frames=200)
     same = write_dataset(tmp_path / "same", [(state, state) for _, state in made])
-    assert "Every state is the command of the same frame" in called("compare", same)
+    assert "Every state is a command" in called("compare", same)
     late = write_dataset(tmp_path / "late", [(np.r_[state[1:], state[-1:]], state) for _, state in made])
-    assert "Every state is the command of the frame before" in called("compare", late)
+    assert "Every state is a command" in called("compare", late)
     assert "Every state" not in called("compare", write_dataset(tmp_path / "set", made))

@@ -12,8 +12,7 @@ from armcal.errors import DataError, PluginError
 pytest.importorskip("pyarrow")
 import pyarrow as pa
 import pyarrow.parquet as pq
-from armcal_lerobot.recordings import ACTION, STATE, Recording, open_recording
-from armcal_lerobot.tracking import read_motion
+from armcal_lerobot.recordings import STATE, Recording, open_recording
 
 from tests.plugins.lerobot.planted import MOTORS, episodes, write_dataset
 
@@ -38,7 +37,7 @@ def rewritten(path: Path, **columns: object) -> None:
 
 
 def all_of(recording: Recording) -> list:
-    return list(recording.read((ACTION, STATE)))
+    return list(recording.stretches())
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -47,11 +46,21 @@ def test_numbers_are_those_that_were_recorded(tmp_path: Path, version: str) -> N
     recording = open_recording(write_dataset(tmp_path / "set", made, version))
     assert recording.motors == MOTORS and recording.fps == 30
     read = all_of(recording)
-    assert max(map(len, read)) <= 4096
-    for feature, place in ((ACTION, 0), (STATE, 1)):
-        values = np.concatenate([frames.vectors[feature] for frames in read])
-        np.testing.assert_allclose(values, np.concatenate([episode[place] for episode in made]), atol=1e-4)
-    assert np.concatenate([frames.episode for frames in read]).tolist() == np.repeat([0, 1, 2], 5000).tolist()
+    assert [stretch.episode for stretch in read] == [0, 1, 2]
+    for stretch, (action, state) in zip(read, made, strict=True):
+        np.testing.assert_allclose(stretch.commanded, action, atol=1e-4)
+        np.testing.assert_allclose(stretch.reached, state, atol=1e-4)
+
+
+def test_a_gap_ends_a_stretch(folder: Path) -> None:
+    path = files(folder)[0]
+    frames = pq.read_table(path).num_rows
+    table = pq.read_table(path).take([row for row in range(frames) if not 20 <= row < 25])
+    pq.write_table(table, path)
+    info = folder / "meta" / "info.json"
+    info.write_text(info.read_text().replace('"total_frames": 180', '"total_frames": 175'))
+    stretches = open_recording(folder).motion
+    assert [(s.episode, int(s.frame[0]), len(s.frame)) for s in stretches][:2] == [(0, 0, 20), (0, 25, 35)]
 
 
 def test_a_file_that_was_cut_off_is_named(folder: Path) -> None:
@@ -76,38 +85,27 @@ def test_a_missing_column_is_named(folder: Path) -> None:
         all_of(open_recording(folder))
 
 
-def test_vectors_of_another_length_are_named_with_their_row(folder: Path) -> None:
+@pytest.mark.parametrize("wrong", [[0.0] * 5, [0.0] * 5 + [float("nan")], None])
+def test_rows_without_the_numbers_of_all_motors_are_refused(folder: Path, wrong: list | None) -> None:
     path = files(folder)[0]
     rows = pq.read_table(path).num_rows
-    rewritten(path, action=pa.array([[0.0] * (6 if row != 7 else 5) for row in range(rows)]))
-    with pytest.raises(DataError, match=rf"{path.name}, row 8, action: found 5 numbers, expected 6"):
+    rewritten(path, action=pa.array([[0.0] * 6] * (rows - 1) + [wrong]))
+    with pytest.raises(DataError, match=rf"{path.name}, action: .* expected 6 in each"):
         all_of(open_recording(folder))
-
-
-def test_numbers_that_are_none_are_named(folder: Path) -> None:
-    path = files(folder)[0]
-    rows = pq.read_table(path).num_rows
-    for values in ([[0.0] * 6] * (rows - 1) + [[float("nan")] * 6], [[0.0] * 6] * (rows - 1) + [None]):
-        rewritten(path, action=pa.array(values))
-        with pytest.raises(DataError, match=rf"row {rows}, action"):
-            all_of(open_recording(folder))
     rewritten(path, action=pa.array(["x"] * rows))
-    with pytest.raises(DataError, match="expected a list of 6 numbers"):
+    with pytest.raises(DataError, match="expected 6 in each"):
         all_of(open_recording(folder))
 
 
-def test_episodes_shorter_than_their_meta_data_are_named(folder: Path) -> None:
+def test_missing_frames_are_named(folder: Path) -> None:
     path = files(folder)[0]
     pq.write_table(pq.read_table(path).slice(0, 50), path)
-    with pytest.raises(DataError, match=r"found 50 frames of episode 0, expected 60"):
+    with pytest.raises(DataError, match=r"found \d+ frames, expected 180 \(meta/info\.json\)"):
         all_of(open_recording(folder))
-
-
-def test_a_missing_episode_is_named(tmp_path: Path) -> None:
-    folder = write_dataset(tmp_path / "set", episodes({}, count=3, frames=60))
-    files(folder)[1].unlink()
-    with pytest.raises(DataError, match=r"found no file episode_000001\.parquet"):
-        open_recording(folder)
+    for file in files(folder):
+        file.unlink()
+    with pytest.raises(DataError, match=r"found 0 frames, expected 180"):
+        all_of(open_recording(folder))
 
 
 @pytest.mark.parametrize(
@@ -117,7 +115,7 @@ def test_a_missing_episode_is_named(tmp_path: Path) -> None:
         ({"fps": "30"}, "found fps '30' and total_frames"),
         ({"total_frames": 10**30}, "and total_frames 1000"),
         ({"total_frames": 0}, "and total_frames 0, expected numbers from 1"),
-        ({"features": []}, "no features"),
+        ({"features": []}, "found no feature observation.state"),
         ({"features": {"action": 3, "observation.state": [1]}}, "found no feature observation.state"),
         ({"features": {"observation.state": {"dtype": "float32", "shape": ["x"]}}}, "found no feature observation"),
         ({"features": {"action": {"dtype": "float32", "shape": [6]}}}, "found no feature observation.state"),
@@ -133,31 +131,16 @@ def test_meta_data_that_cannot_be_used_are_refused(folder: Path, changed: dict, 
         open_recording(folder)
 
 
-def test_a_motor_that_comes_twice_is_named(folder: Path) -> None:
-    path = folder / "meta" / "info.json"
-    path.write_text(path.read_text().replace("elbow_flex.pos", "wrist_flex.pos"))
-    with pytest.raises(DataError, match="found the motor 'wrist_flex' twice"):
-        read_motion(open_recording(folder), "degrees", None)
-
-
 def test_actions_of_other_motors_are_refused(folder: Path) -> None:
     path = folder / "meta" / "info.json"
     info = json.loads(path.read_text())
     info["features"]["action"]["names"] = ["x", "y", "z", "roll", "pitch", "yaw"]
     path.write_text(json.dumps(info))
     with pytest.raises(DataError, match="expected the same motors"):
-        read_motion(open_recording(folder), "degrees", None)
+        open_recording(folder)
 
 
 def test_without_pyarrow_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow.parquet", None)
     with pytest.raises(PluginError, match=r"needs the library pyarrow.*pip install 'armcal\[lerobot\]'"):
         all_of(open_recording(folder))
-
-
-def test_large_data_sets_are_thinned_by_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("armcal_lerobot.tracking.MOST_FRAMES", 200)
-    folder = write_dataset(tmp_path / "set", episodes({}, count=6, frames=100), "v3.0")
-    motion = read_motion(open_recording(folder), "degrees", None)
-    assert (motion.frames, motion.of) == (200, 600)
-    assert [stretch.episode for stretch in motion.stretches] == [0, 3]

@@ -12,9 +12,8 @@ from click.testing import CliRunner
 
 pytest.importorskip("pyarrow")
 from armcal_lerobot.command import lerobot
-from armcal_lerobot.recordings import open_recording
-from armcal_lerobot.rest_records import records_of
-from armcal_lerobot.tracking import read_motion
+from armcal_lerobot.motor_file import read_motors
+from armcal_lerobot.recordings import open_recording, records_of
 
 from tests.plugins.lerobot.planted import FPS, MOTORS, write_dataset, write_motors
 
@@ -64,20 +63,17 @@ def test_rests_are_found_with_the_side_they_came_from(tmp_path: Path, version: s
 
 
 def test_percent_becomes_degrees_by_the_file(tmp_path: Path) -> None:
-    recording = open_recording(write_dataset(tmp_path / "set", with_rests(1)))
-    file = write_motors(tmp_path / "arm.json")
-    from armcal_lerobot.motor_file import read_motors
-
-    records = records_of(recording, "percent", read_motors(file), "action", 0.5, 0.5)
+    data, file = write_dataset(tmp_path / "set", with_rests(1)), read_motors(write_motors(tmp_path / "arm.json"))
+    records = records_of(open_recording(data, "percent", file), "action", 0.5, 0.5)
     assert records[0].degrees[MOTORS.index("shoulder_pan")] == pytest.approx(10 * 1137.5 * 360 / 4095 / 100)
     with pytest.raises(InputError, match="percent"):
-        records_of(recording, "percent", None, "action", 0.5, 0.5)
+        records_of(open_recording(data, "percent"), "action", 0.5, 0.5)
 
 
 def test_no_rest_is_refused(tmp_path: Path) -> None:
     recording = open_recording(write_dataset(tmp_path / "set", with_rests(1)))
     with pytest.raises(DataError, match=r"found no 5 s in which no motor moved by more than 0.5 deg"):
-        records_of(recording, "degrees", None, "state", 5.0, 0.5)
+        records_of(recording, "state", 5.0, 0.5)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -112,13 +108,16 @@ def test_images_are_of_the_rests(tmp_path: Path, version: str) -> None:
 def test_wrong_joints_and_units_are_refused(tmp_path: Path) -> None:
     made = [(3 * action, 3 * state) for action, state in with_rests(1)]
     data, file = write_dataset(tmp_path / "set", made), write_motors(tmp_path / "arm.json")
-    for joint, message in (("elbow_flx=-elbow_flex", "no motor 'elbow_flx'"), ("elbow_flex=shoulder_pan", "twice")):
+    for joint, message in (
+        ("elbow_flx=-elbow_flex", "found --joint 'elbow_flx=-elbow_flex'"),
+        ("elbow_flex=shoulder_pan", "twice"),
+    ):
         with pytest.raises(InputError, match=message):
             called(data, "--out", tmp_path / "rests.csv", "--joint", joint)
     radians = write_dataset(tmp_path / "radians", [(np.radians(a), np.radians(s)) for a, s in with_rests(1)])
     with pytest.raises(DataError, match="they look like radians"):
         called(radians, "--out", tmp_path / "rests.csv")
     with pytest.raises(DataError, match="they look like radians"):
-        read_motion(open_recording(radians), "degrees", None)
+        assert open_recording(radians).motion
     with pytest.raises(DataError, match="expected percent"):
         called(data, "--out", tmp_path / "rests.csv", "--units", "percent", "--calibration", file)

@@ -1,0 +1,252 @@
+"""A motor calibration file and an arm: which motor turns which joint, what the file's zeros cost at the gripper, its
+sections of a configuration, and calibrated zeros for it.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from glob import escape
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import yaml
+from armcal import Finding
+from armcal.arm.joints import joint_limits
+from armcal.arm.servo import teeth_text
+from armcal.base.arrays import Array
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.joint_zeros import Zero
+from armcal.calibration.tool_expression import arm_expression
+from armcal.config.system import build_system
+from armcal.config.yaml_source import load_config
+from armcal.errors import ConfigError, DataError, InputError, Location
+from armcal.plugins import PluginRegistry
+from armcal.report.document import Document, Section, Table
+
+from armcal_lerobot.motor_file import (
+    COUNTS_A_TURN,
+    DEGREES_A_COUNT,
+    IN_THE_MIDDLE,
+    LARGEST_OFFSET,
+    Motor,
+    MotorFile,
+    Units,
+    is_gripper,
+    read_motors,
+    remount,
+    require_motors,
+    teeth_of,
+    zero_shift_deg,
+)
+
+_POSES, _SEED = 2000, 1
+
+
+def wiring_of(
+    joints: Sequence[str], motors: Sequence[str], texts: Sequence[str], idle: Iterable[str] = ()
+) -> dict[str, tuple[str, int]]:
+    """By joint, the motor that turns it and its sense: 1, or -1 where the joint turns the other way.
+
+    A motor turns the joint of its name unless one of ``texts`` (``MOTOR=JOINT`` or ``MOTOR=-JOINT``) says otherwise.
+    Joints that are ``idle`` may be without one.
+    """
+    wiring = {joint: (joint, 1) for joint in (*joints, *idle)}
+    stated = []
+    for text in texts:
+        motor, _, signed = text.partition("=")
+        joint = signed.removeprefix("-")
+        stated.append(joint)
+        if motor not in motors or joint not in wiring:
+            hint = f"The motors are {', '.join(motors)}; the joints are {', '.join(wiring)}."
+            raise InputError(f"found --joint {text!r}, expected MOTOR=JOINT or MOTOR=-JOINT (reversed).", hint=hint)
+        wiring[joint] = (motor, -1 if signed.startswith("-") else 1)
+    turning = [motor for motor, _ in wiring.values()]
+    twice = next((name for names in (stated, turning, joints) for name in names if list(names).count(name) > 1), None)
+    if twice is not None:
+        hint = "Where two are exchanged give --joint for both of them."
+        raise InputError(f"found {twice} twice, by --joint and by its own name, expected it once.", hint=hint)
+    missing = next((joint for joint in joints if wiring[joint][0] not in motors), None)
+    if missing is not None:
+        free = ", ".join(motor for motor in motors if motor not in turning and not is_gripper(motor)) or "none"
+        hint = f"Say which one turns it, --joint MOTOR={missing} (or =-{missing}), or give the files of one arm."
+        raise InputError(f"found no motor for the joint {missing}; motors without a joint: {free}.", hint=hint)
+    return wiring
+
+
+def distances_mm(metres: Array) -> dict[str, float]:
+    """Distances (N, m) at the gripper over poses: typical (the median) and largest."""
+    return {"typical_mm": 1000 * float(np.median(metres)), "largest_mm": 1000 * float(np.max(metres))}
+
+
+class Gripper:
+    """The tool of an arm: at nominal parameters, or at those of a calibration.
+
+    Attributes:
+        name: of the arm.
+        wiring: by commanded joint, base to tip, its motor and its sense.
+        ranges_deg: by motor, how far its joint goes by the model; infinite where that states no limits.
+    """
+
+    def __init__(
+        self, path: Path, arm: str | None, motors: Sequence[str], texts: Sequence[str], registry: PluginRegistry
+    ) -> None:
+        source, where = load_config(path), Location(str(path))
+        if "armcal_calibration" in source.data:
+            loaded = Calibration.load(path, registry)
+            system, parameters = loaded.system, loaded.parameters
+        else:
+            # Where the gripper is needs no measurement: a file of the arm alone will do.
+            system = build_system(replace(source, data={"measurements": {}, **source.data}), registry)
+            parameters = system.parameters()
+        if arm not in system.arms and (arm is not None or len(system.arms) > 1):
+            hint = "Choose one with --arm-name NAME."
+            raise ConfigError(f"found the arms {', '.join(system.arms)}.", where=where, hint=hint)
+        self.name = arm or next(iter(system.arms))
+        expression = arm_expression(system.arms[self.name], parameters, system.environment)
+        self.wiring = wiring_of(expression.joints, motors, texts)
+        limits = joint_limits(system.arms[self.name].nominal_chain)
+        ends = {motor: limits[joint] for joint, (motor, _) in self.wiring.items()}
+        self.ranges_deg = {motor: math.degrees(e[1] - e[0]) if e else math.inf for motor, e in ends.items()}
+        commands = ca.SX.sym("commands", len(self.wiring))
+        full = ca.vertcat(commands, ca.DM(expression.defaults[len(self.wiring) :]))
+        outputs = [ca.SX(ca.densify(part)) for part in (expression.base_T_tool.translation, expression.efforts)]
+        at_record = ca.Function("rigid", [expression.record, expression.state], outputs)
+        place, efforts = at_record(full, ca.DM.zeros(expression.state.shape))
+        slope = ca.densify(ca.jacobian(place, commands))
+        self._function = ca.Function("gripper", [commands], [place, ca.vec(slope), efforts[: len(self.wiring)]])
+
+    def positions(self, angles: Array) -> Array:
+        """The tool frame's origin (3 x N; m, base frame) for joint angles (n x N; rad); springs are at rest."""
+        return self._values(angles, 0)
+
+    def torques(self, motors: Sequence[str], degrees: Array) -> Array:
+        """Gravity about the joint of each motor (N m) for their angles (N x motors; deg); NaN without a joint."""
+        efforts, columns = self._values(self.angles(motors, degrees), 2), np.full(degrees.shape, np.nan)
+        for (motor, sense), effort in zip(self.wiring.values(), efforts, strict=True):
+            columns[:, list(motors).index(motor)] = sense * effort
+        return columns
+
+    def angles(self, motors: Sequence[str], degrees: Array) -> Array:
+        """Joint angles (n x N; rad) of motor angles (N x motors; deg)."""
+        rows = [sense * degrees[:, list(motors).index(motor)] for motor, sense in self.wiring.values()]
+        return np.asarray(np.radians(np.vstack(rows)))
+
+    def poses(self, motors: Mapping[str, Motor]) -> Array:
+        """Joint angles (n x N; rad) drawn evenly from the motors' ranges."""
+        random = np.random.default_rng(_SEED)
+        halves = [motor.range_deg / 2 for motor in motors.values()]
+        return self.angles(list(motors), np.column_stack([random.uniform(-half, half, _POSES) for half in halves]))
+
+    def per_degree(self, angles: Array) -> dict[str, dict[str, float]]:
+        """By motor, what one degree of its joint moves the gripper over poses (n x N; rad)."""
+        slopes = np.radians(1.0) * self._values(angles, 1).reshape(len(self.wiring), 3, -1)
+        costs = map(distances_mm, np.linalg.norm(slopes, axis=1))
+        return {motor: cost for (motor, _), cost in zip(self.wiring.values(), costs, strict=True)}
+
+    def moved_mm(self, file: MotorFile, other: MotorFile, angles: Array, units: Units) -> dict[str, float]:
+        """How far another file moves the gripper at the commands of these poses (n x N; rad) by a first one."""
+        moved = []
+        for row, (name, sense) in zip(angles, self.wiring.values(), strict=True):
+            one, two = file.motors[name], other.motors[name]
+            stretched = two.degrees_in(units) / one.degrees_in(units) - 1
+            moved.append(sense * np.radians(zero_shift_deg(one, two)) + stretched * row)
+        apart = self.positions(angles + np.vstack(moved)) - self.positions(angles)
+        return distances_mm(np.linalg.norm(apart, axis=0))
+
+    def _values(self, angles: Array, output: int) -> Array:
+        return np.asarray(self._function.map(angles.shape[1])(angles)[output].full())
+
+
+def checked(file: MotorFile, other: MotorFile | None, gripper: Gripper | None, units: Units) -> Document:
+    """A row a motor: what is odd about a file, what moved since it was written, what that does at the gripper."""
+    ranges = gripper.ranges_deg if gripper else {}
+    notes = [text for motor in file.motors.values() for text in motor.notes(ranges.get(motor.name))]
+    motors = {name: {**asdict(motor), "range_deg": motor.range_deg} for name, motor in file.motors.items()}
+    content: dict[str, Any] = {"notes": notes, "motors": motors}
+    headings, texts, title = ["motor", "range, deg"], [], file.path.name
+    rows = {name: [name, f"{motor.range_deg:.1f}"] for name, motor in file.motors.items()}
+    if other is not None:
+        require_motors(other, list(file.motors))
+        headings.append("moved, deg")
+        title += f" and {other.path.name}"
+        notes += [f"{other.path.name}: {text}" for m in other.motors.values() for text in m.notes(ranges.get(m.name))]
+        for name, motor in file.motors.items():
+            apart = zero_shift_deg(motor, other.motors[name])
+            teeth = teeth_of(apart)
+            motors[name] |= {"zero_moved_deg": apart, "teeth": teeth}
+            rows[name].append(f"{apart:+.2f}")
+            texts += [f"{name}: {apart:+.1f} deg are {teeth_text(teeth)}."] if teeth else []
+    if gripper is not None:
+        headings += ["mm per deg, typically", "at most"]
+        angles = gripper.poses(file.motors)
+        for name, cost in gripper.per_degree(angles).items():
+            motors[name]["mm_per_deg"] = cost
+            rows[name] += [f"{number:.1f}" for number in cost.values()]
+    if gripper is not None and other is not None:
+        moved = content["moved_mm"] = gripper.moved_mm(file, other, angles, units)
+        texts.append(
+            f"At the same command the gripper stands {moved['typical_mm']:.1f} mm elsewhere in a typical pose, "
+            f"{moved['largest_mm']:.1f} mm at most, if no horn was remounted between the files."
+        )
+    table = Table("Motors", headings, [[*row, *["-"] * (len(headings) - len(row))] for row in rows.values()])
+    section = Section("Motors", parts=[table, *texts], level="always")
+    return Document(title, title, [section], summary=[Finding("warning", note) for note in notes], data=content)
+
+
+def bus_joints(file: MotorFile, gripper: Gripper | None, model: str) -> str:
+    """The joints of a servo bus whose angles are those of LeRobot, as a section of a configuration."""
+    arm = gripper.name if gripper else "arm"
+    wiring = gripper.wiring if gripper else {name: (name, 1) for name in file.motors if not is_gripper(name)}
+    joints = {}
+    for joint, (name, sense) in wiring.items():
+        motor, zero = file.motors[name], round(file.motors[name].middle)
+        if passed := motor.passed_end(gripper.ranges_deg[name] if gripper else None):
+            raise DataError(passed, where=Location(str(file.path), field=name), hint=IN_THE_MIDDLE)
+        ends = sorted(sense * (count - zero) * 360 / COUNTS_A_TURN for count in (motor.range_min, motor.range_max))
+        joints[f"{arm}.{joint}"] = {
+            "id": motor.id,
+            "model": model,
+            "zero_count": zero,
+            "offset": motor.homing_offset,
+            "direction": sense,
+            "range_deg": [math.ceil(10 * ends[0]) / 10, math.floor(10 * ends[1]) / 10],
+        }
+    device = {"type": "servobus", "port": "/dev/ttyACM0", "joints": joints}
+    return yaml.safe_dump({"bench": {"device": device}}, sort_keys=False, default_flow_style=None, width=120)
+
+
+def rezeroed(file: MotorFile, zeros: Mapping[str, Zero], wiring: Mapping[str, tuple[str, int]]) -> dict[str, Motor]:
+    """Motors that a calibration changes, by name, with their zero where it has it.
+
+    The homing offset moves the zero. The range stays about the same middle, since that is zero in degrees, and loses at
+    both ends what the zero moved: so the joint goes nowhere that the file did not let it go before.
+    """
+    changed = {}
+    for joint, zero in zeros.items():
+        name, sense = wiring[joint]
+        motor, counts = file.motors[name], -round(sense * zero.degrees / DEGREES_A_COUNT)
+        offset, trim = motor.homing_offset + counts, 0 if motor.turns_freely else abs(counts)
+        where = Location(str(file.path), field=f"{name}.homing_offset")
+        if abs(offset) > LARGEST_OFFSET:
+            limits = f"-{LARGEST_OFFSET} to {LARGEST_OFFSET} (a sign and 11 bits)"
+            raise InputError(f"the new offset would be {offset}, expected {limits}.", where=where, hint=remount(offset))
+        if motor.range_max - motor.range_min <= 2 * trim:
+            text = f"the zero would move by {zero.degrees:+.1f} deg, more than half of the range."
+            hint = "Run lerobot-calibrate again, with the joint moved from end to end, then calibrate the arm again."
+            raise InputError(text, where=where, hint=hint)
+        low, high = motor.range_min + trim, motor.range_max - trim
+        if counts:
+            changed[name] = replace(motor, homing_offset=offset, range_min=low, range_max=high)
+    return changed
+
+
+def require_not_written(file: MotorFile, zeros: Mapping[str, Zero], wiring: Mapping[str, tuple[str, int]]) -> None:
+    """Raise InputError if these zeros made the file of an older one beside it: written again they would count twice."""
+    for path in sorted(file.path.parent.glob(f"{escape(file.path.stem)}.before-*{file.path.suffix}")):
+        old = read_motors(path)
+        if set(file.motors) == set(old.motors) and {**old.motors, **rezeroed(old, zeros, wiring)} == file.motors:
+            hint = "Record anew with this file, and calibrate from those records; or take the old file back first."
+            text = f"it has these zeros already: they were written over {path.name}."
+            raise InputError(text, where=Location(str(file.path)), hint=hint)
