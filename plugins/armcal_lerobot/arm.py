@@ -178,6 +178,11 @@ def checked(file: MotorFile, other: MotorFile | None, gripper: Gripper | None, u
             motors[name] |= {"zero_moved_deg": apart, "teeth": teeth}
             rows[name].append(f"{apart:+.2f}")
             texts += [f"{name}: {apart:+.1f} deg are {teeth_text(teeth)}."] if teeth else []
+            if motor.id != other.motors[name].id:
+                text = f"{name} has the id {motor.id} in {file.path.name}, {other.motors[name].id} in {other.path.name}"
+                notes.append(
+                    f"{text}: another servo answers to it, and what moved is not known. Give each its id again."
+                )
     if gripper is not None:
         headings += ["mm per deg, typically", "at most"]
         angles = gripper.poses(file.motors)

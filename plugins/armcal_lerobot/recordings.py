@@ -126,7 +126,7 @@ class Recording:
             tables = sorted((self.folder / "meta" / "episodes").glob("chunk-*/*.parquet"))
             for _, batch in _batches(tables, ("episode_index", *columns)):
                 numbers = batch.column("episode_index").to_pylist()
-                if episode in numbers:
+                if episode in numbers and columns[0] in batch.schema.names:
                     chunk, file, start = (batch.column(name)[numbers.index(episode)].as_py() for name in columns)
                     path = videos / camera / f"chunk-{int(chunk):03d}" / f"file-{int(file):03d}.mp4"
                     first = round(float(start) * self.fps)
@@ -173,14 +173,9 @@ def _batches(paths: Iterable[Path], columns: Collection[str]) -> Iterator[tuple[
     for path in paths:
         try:
             with parquet.ParquetFile(path, memory_map=True) as table:
-                there = table.schema_arrow.names
-                for column in columns:
-                    if column not in there:
-                        text = f"found no column {column}; found {', '.join(there)[:200]}."
-                        raise DataError(text, where=Location(str(path), field=column), hint=_WHOLE)
                 some = table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
                 yield from ((path, batch) for batch in some if batch.num_rows)
-        except (OSError, ValueError, KeyError) as fault:  # pyarrow's own errors derive from these
+        except (OSError, ValueError) as fault:  # pyarrow's own errors derive from these
             reason = (str(fault) or type(fault).__name__).splitlines()[0][:120]
             raise DataError(f"it is damaged or cut off ({reason}).", where=Location(str(path)), hint=_WHOLE) from fault
 
@@ -189,10 +184,10 @@ def _numbers(path: Path, batch: Any, name: str, width: int) -> Array:
     """A column of numbers, or of lists of numbers (N x width)."""
     try:
         values = np.array(batch.column(name).to_pylist(), dtype=float).reshape(batch.num_rows, width)
-    except (TypeError, ValueError):
+    except (KeyError, TypeError, ValueError):  # there is no such column, or no number in it
         values = np.full((1, 1), np.nan)
     if not np.isfinite(values).all():
-        text = f"found a row that does not hold finite numbers, expected {width} in each (meta/info.json)."
+        text = f"found no column, or a row without finite numbers, expected {width} in each row (meta/info.json)."
         raise DataError(text, where=Location(str(path), field=name), hint="Leave that episode out.")
     return values
 

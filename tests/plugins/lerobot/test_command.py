@@ -56,6 +56,12 @@ def test_what_a_wrong_zero_costs(tmp_path: Path) -> None:
     assert "At the same command the gripper stands" in called("check", one, two, "--arm", ARM)
 
 
+def test_servos_that_were_exchanged_between_the_files_are_named(tmp_path: Path) -> None:
+    one, swapped = write_motors(tmp_path / "one.json"), {"shoulder_lift": {"id": 3}, "elbow_flex": {"id": 2}}
+    notes = json_of("check", one, write_motors(tmp_path / "two.json", **swapped))["notes"]
+    assert "shoulder_lift has the id 2 in one.json, 3 in two.json" in notes[0] and len(notes) == 2
+
+
 def test_a_joint_without_a_motor_is_named_with_the_motors_that_turn_none(tmp_path: Path) -> None:
     file = tmp_path / "one.json"
     entries = json.loads(write_motors(file).read_text())
