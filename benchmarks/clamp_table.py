@@ -90,7 +90,7 @@ def clamp_study(seeds: Iterable[int]) -> dict[str, ClampErrors]:
     for name, way in ways.items():
         fits = [way.fit(dataset) for dataset in recordings]
         errors = [[found.values[found.parameters.entries_of(n)][0] for n in OFFSETS] for found in fits]
-        told = [dict(zip(found.names, found.identified_by_data, strict=True)) for found in fits]
+        told = [{n: by == "data" for n, by in zip(own.names, own.determined_by, strict=True)} for own in fits]
         result[name] = ClampErrors(np.array(errors) - truth, tuple({n for n in OFFSETS if not t[n]} for t in told))
     return result
 

@@ -87,7 +87,7 @@ def _made(system: System, values: Sequence[float]) -> Calibration:
     parameters = system.parameters({})
     own = {block.name for arm in system.arms.values() for block in arm.parameters()}
     free = [name for name in parameters.names if name in own]
-    units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]
+    units = [unit for block in parameters.blocks for unit in block.entry_units]
     nominal = parameters.nominal()
     entries = [
         {

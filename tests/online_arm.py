@@ -85,7 +85,7 @@ def calibration(
     covariance = _prior(system, parameters.with_nominal(values)) * sd_factor**2
     names = [parameters.entry_names[i] for i in parameters.free_entries]
     known = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
-    units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]
+    units = [unit for block in parameters.blocks for unit in block.entry_units]
     entries = [
         {"name": name, "unit": unit, "nominal": value, "value": value, "free": name in known, "sd": known.get(name)}
         for name, unit, value in zip(parameters.entry_names, units, values.tolist(), strict=True)

@@ -31,7 +31,7 @@ NAMES = {
     "leftover": "residual_structure",
     "misses": "large_errors",
     "mixup": "permuted_axes",
-    "told_by_data": "identified_by_data",
+    "told_by_data": "determined_by",
     "nimbleness": "dexterity",
     "Walk": "JournalReplayer",
     "Witness": "ReplayVerifier",

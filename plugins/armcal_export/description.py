@@ -161,14 +161,18 @@ def _joint(joint: RigidJoint) -> dict[str, Any]:
 
 def _parameters(request: ExportRequest) -> list[dict[str, Any]]:
     if request.entries:
-        names = ("name", "unit", "nominal", "value", "free", "sd", "determined")
-        return [{name: getattr(entry, name) for name in names} for entry in request.entries]
+        names, entries = ("name", "unit", "nominal", "value", "free", "sd"), request.entries
+        by_data = [one.determined_by and one.determined_by == "data" for one in entries]
+        described = [{name: getattr(entry, name) for name in names} for entry in entries]
+        return [{**own, "determined": by} for own, by in zip(described, by_data, strict=True)]
     blocks = {block.name: block for block in request.arm.parameters()}
     unknown = {"free": False, "sd": None, "determined": None}
     return [
-        {"name": name, "unit": blocks[key].entry_unit, "nominal": nominal, "value": float(value), **unknown}
+        {"name": name, "unit": unit, "nominal": nominal, "value": float(value), **unknown}
         for key, numbers in request.values.items()
-        for name, nominal, value in zip(blocks[key].entry_names, blocks[key].nominal, numbers, strict=True)
+        for name, unit, nominal, value in zip(
+            blocks[key].entry_names, blocks[key].entry_units, blocks[key].nominal, numbers, strict=True
+        )
     ]
 
 

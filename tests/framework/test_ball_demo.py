@@ -37,8 +37,10 @@ def test_it_is_judged_on_positions_that_did_not_train(metrics):
 
 
 def test_all_that_is_free_is_determined_by_the_postures(metrics):
-    assert metrics["parameters"]["determined"] == metrics["parameters"]["free"] == 37
-    assert metrics["parameters"]["undetermined"] == metrics["parameters"]["held_by_priors"] == []
+    assert metrics["parameters"]["rank"] == metrics["parameters"]["free"] == 37
+    assert metrics["parameters"]["undetermined"] == [] and {*metrics["parameters"]["determined_by"].values()} == {
+        "data"
+    }
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def test_an_estimate_far_beyond_its_bound_keeps_an_interval_as_wide_as_its_devia
     place = beyond.names.index("arm.spring.k2")
     interval, sd = beyond.intervals[place], beyond.deviations[place]
     assert beyond.unconstrained[place] < -5 * sd and "arm.spring.k2" in beyond.at_bound
-    assert interval.bound == "lower" and interval.lower == 0
+    assert interval.bounds == ("lower",) and interval.lower == 0
     assert 1.9 * sd < interval.upper < 2.1 * sd
 
 
@@ -65,23 +65,29 @@ def test_what_a_bound_shifts_beside_itself_is_named(beyond: Estimate) -> None:
     assert not shift_findings(free)
 
 
-@pytest.mark.parametrize(("deviations", "shown"), [(0.5, "≤"), (2.9, "≤"), (3.1, " to ")])
+@pytest.mark.parametrize(
+    ("deviations", "remark"), [(0.5, "lower end at its bound"), (2.9, "lower end at its bound"), (3.1, "")]
+)
 def test_the_end_that_is_a_bound_is_not_guessed_from_where_the_value_lies(
-    beyond: Estimate, deviations: float, shown: str
+    beyond: Estimate, deviations: float, remark: str
 ) -> None:
     place = beyond.names.index("arm.spring.k2")
     own = deviations * beyond.deviations[place]
     values, unconstrained = beyond.values.copy(), beyond.unconstrained.copy()
     values[beyond.free_entries[place]] = unconstrained[place] = own
-    assert shown in parameters_table(replace(beyond, values=values, unconstrained=unconstrained)).rows[place][5]
+    moved = replace(beyond, values=values, unconstrained=unconstrained)
+    row, interval = parameters_table(moved).rows[place], moved.intervals[place]
+    lower, upper = (float(end) for end in row[5].split(" to "))
+    assert row[-1] == remark and (lower == 0) == bool(remark)
+    assert (lower, upper) == pytest.approx((interval.lower, interval.upper), abs=1e-3)
 
 
 def test_a_parameter_with_the_deviation_of_its_prior_is_not_determined_by_data() -> None:
     tight = fitted(SPRINGS, {"arm.spring.k2": 0.05}, "parameters.priors={arm.mdh.theta2: 0.0001 deg}")
     records = {record.name: record for record in parameter_records(tight)}
     held, free = records["arm.mdh.theta2"], records["arm.mdh.theta3"]
-    assert held.sd == pytest.approx(np.radians(0.0001), rel=1e-2) and free.determined and not free.held_by_prior
-    assert not held.determined and held.held_by_prior
+    assert held.sd == pytest.approx(np.radians(0.0001), rel=1e-2) and free.determined_by == "data"
+    assert held.determined_by == "prior"
 
 
 def test_names_and_values_pair(beyond: Estimate) -> None:

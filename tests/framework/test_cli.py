@@ -61,7 +61,7 @@ def test_a_run_leaves_every_file_and_says_the_same_in_json(demo: Path) -> None:
     for model in ("nominal", "calibrated"):
         for records in ("train", "holdout", "cross_validated"):
             assert set(metrics["error_mm"][model][records]) == {"mean", "rms", "p95", "max", "count"}
-    assert metrics["parameters"]["free"] == metrics["parameters"]["determined"] == 28
+    assert metrics["parameters"]["free"] == metrics["parameters"]["rank"] == 28
     assert {"name", "status", "iterations", "seconds"} <= set(metrics["solver"])
     assert metrics["seconds"]["total"] > 0
 

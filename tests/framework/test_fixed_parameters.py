@@ -103,7 +103,7 @@ def test_what_free_parameters_do_already_is_no_candidate(folder: Path) -> None:
     assert {"arm.mdh.theta1", "arm.mdh.d1"} <= set(names)
     assert not [name for name in names if name in own or name.startswith("statics.")]
     wide = assemble(loaded(folder, (), f"parameters.free={json.dumps([*own, *names])}"), Stopwatch())
-    chosen = freeing(wide.training, own, wide.problem.parameters.nominal())
-    seen = {one.name for one in (*chosen.gaining, *chosen.others)}
+    gaining, others = freeing(wide.training, own, wide.problem.parameters.nominal())
+    seen = {one.name for one in (*gaining, *others)}
     assert not {"arm.mdh.theta1", "arm.mdh.d1"} & seen
-    assert all(np.all(one.sd > 0) for one in (*chosen.gaining, *chosen.others))
+    assert all(np.all(one.sd > 0) for one in (*gaining, *others))

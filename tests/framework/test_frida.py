@@ -118,11 +118,15 @@ def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
     kept = {p["name"]: p for p in yaml.safe_load((out / "calibration.yaml").read_text())["parameters"] if p["free"]}
     assert told["solver"]["converged"]
     parameters = told["parameters"]
-    held, determined = set(parameters["held_by_priors"]), {n for n, p in kept.items() if p["determined"]}
-    assert held | determined == set(kept) and not held & determined
-    assert parameters["free"] - parameters["determined"] == len(parameters["undetermined"]) <= len(held)
-    alone = [f["text"] for f in told["verdict"]["findings"] if "determined by priors alone" in f["text"]]
-    assert all(text.startswith(f"{len(parameters['undetermined'])} combination") for text in alone)
+    held, determined = ({n for n, p in kept.items() if p["determined_by"] == by} for by in ("prior", "data"))
+    assert held | determined == set(kept)
+    if all("axis" not in n for n in kept):
+        assert parameters["determined_by"] == {n: p["determined_by"] for n, p in kept.items()}
+    by_data = list(parameters["determined_by"].values()).count("data")
+    assert parameters["free"] - parameters["rank"] == len(parameters["undetermined"]) <= parameters["free"] - by_data
+    (text,) = (f["text"] for f in told["verdict"]["findings"] if f["text"].startswith("The data determines"))
+    which = f"{by_data} of {parameters['free']} free parameters; held by priors: "
+    assert text.startswith(f"The data determines {which if held else f'all {by_data} free parameters.'}")
     if name not in CASES:
         assert offsets("arm", 1, 3) <= held and "arm.poe.twist2_wx" in held
         assert len(parameters["undetermined"]) == 1
@@ -147,7 +151,7 @@ def test_ranks_with_priors_left_out(name):
     case, found = CASES[name], identified(name, "parameters.priors={}")
     assert (found["rank"], len(found["free"])) == (case.rank, case.free)
     assert found["rank_by_qr"] == case.rank
-    assert len(found["undetermined"]) == len(found["held_by_nothing"]) == case.free - case.rank
+    assert len(found["undetermined"]) == case.free - case.rank and "prior" not in found["determined_by"].values()
     values = np.array(found["singular_values"]) / found["singular_values"][0]
     assert np.all(values[: case.rank] > 1e-6) and np.all(values[case.rank :] < 1e-12), "the rank is a matter of taste"
     assert case.traded <= {name for each in found["undetermined"] for name in terms(each)}
@@ -225,7 +229,7 @@ def test_without_noise_what_is_determined_comes_back_exactly(name):
     """Joints that read exactly, and are believed; so believed, priors pull by less than 1e-8."""
     case = Case.load(name, joint_noise=0.0)
     found = case.fit(case.records())
-    told = np.array(found.identified_by_data)
+    told = np.array(found.determined_by) == "data"
     assert found.verdict.converged and told.any()
     off = found.values[list(found.free_entries)] - case.true_values[list(found.free_entries)]
     assert np.abs(off[told]).max() < 1e-8
@@ -242,8 +246,8 @@ def coverage(names, seeds):
             found = case.fit(case.records(seed))
             assert found.verdict.converged
             true = case.true_values[list(found.free_entries)]
-            rows = zip(found.intervals, true, found.identified_by_data, strict=True)
-            inside += [i.lower <= x <= i.upper for i, x, told in rows if told]
+            rows = zip(found.intervals, true, found.determined_by, strict=True)
+            inside += [i.lower <= x <= i.upper for i, x, by in rows if by == "data"]
     return float(np.mean(inside)), len(inside)
 
 
@@ -284,7 +288,7 @@ def test_where_the_size_is_a_gauge_it_is_told_and_the_closing_angle_is_that_of_t
     assert case.closing_error(found.values, judge, slice(0, 3)) < 1.15 * case.closing_error(
         case.true_values, judge, slice(0, 3)
     )
-    assert not any(found.identified_by_data)
+    assert "data" not in found.determined_by
     assert any("scale is not observable" in text for text in case.warnings(train))
 
 
@@ -309,7 +313,7 @@ def test_all_fourteen_offsets_from_any_truth_in_few_iterations(count):
     scores = []
     for found, off in far_starts(count):
         assert found.verdict.converged and found.verdict.iterations <= 15
-        assert all(found.identified_by_data)
+        assert {*found.determined_by} == {"data"}
         assert np.abs(off).max() < 1e-3
         scores.append(off / found.deviations)
     assert np.mean(np.square(scores)) == pytest.approx(1, abs=0.3)
@@ -325,7 +329,7 @@ def test_where_the_last_axes_are_one_line_thirteen_are_determined_and_the_rest_i
     true = dict(zip(names, np.random.default_rng(3).uniform(-0.07, 0.07, 14), strict=True))
     found = case.fit(case.told({n: x - case.truth[n] for n, x in true.items()}, 0))
     assert found.identifiability.rank == 13 and len(found.identifiability) == 14
-    told = dict(zip(found.names, found.identified_by_data, strict=True))
+    told = {n: by == "data" for n, by in zip(found.names, found.determined_by, strict=True)}
     assert {n for n, flag in told.items() if not flag} == {"left.poe.offset7", "right.poe.offset7"}
     (only,) = found.identifiability.undetermined
     weights = dict(only.terms)

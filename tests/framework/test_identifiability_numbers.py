@@ -10,10 +10,11 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.identifiability import (
     analyse,
     correlated_pairs,
+    determined_by,
     expected_covariance,
     explain,
-    held_by_nothing,
     identify,
+    unheld,
 )
 from planted_arms import PLANTED, POSES, SOUND, full
 
@@ -60,12 +61,17 @@ def test_priors_hold_what_they_touch_and_no_more() -> None:
         blocks = {full(n): replace(problem.parameters[full(n)], prior_sd=0.001) for n in names}
         return problem.parameters.replaced(blocks)
 
-    assert len(held_by_nothing(with_priors(), known)) == 2
+    def by(which: str, *priors: str) -> set[str]:
+        sources = determined_by(known, with_priors(*priors), np.zeros(len(known)))
+        return {name for name, own in zip(known.names, sources, strict=True) if own == which}
+
+    heights = {full("d1"), full("d2"), full("d3")}
+    assert len(unheld(with_priors(), known)) == 2 and by("nothing") == heights
     # One prior can hold one of two: the other two heights still trade.
-    (left,) = held_by_nothing(with_priors("d1"), known)
-    assert set(left.names) == {full("d2"), full("d3")}
-    assert held_by_nothing(with_priors("d1", "d3"), known) == ()
-    assert len(held_by_nothing(with_priors("a1"), known)) == 2
+    assert len(unheld(with_priors("d1"), known)) == 1
+    assert by("nothing", "d1") == {full("d2"), full("d3")} and by("prior", "d1") == {full("d1")}
+    assert len(unheld(with_priors("d1", "d3"), known)) == 0 and by("prior", "d1", "d3") == heights
+    assert len(unheld(with_priors("a1"), known)) == 2
 
 
 def test_a_hardly_determined_direction_is_named_with_its_uncertainty() -> None:

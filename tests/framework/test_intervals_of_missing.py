@@ -50,12 +50,12 @@ def test_what_is_measured_is_judged_as_if_the_rest_were_not_there() -> None:
     assert found is not None and widened is not None
     there = np.abs(errors[np.isfinite(errors)])
     assert found.coordinates == len(there) == 360
-    assert found.raw[1] == pytest.approx(np.mean(there <= 1.6448536))
-    assert found.raw_radius == pytest.approx(np.mean(reaches[np.isfinite(reaches)] <= 1))
-    assert widened.coordinates[1] == pytest.approx(np.sort(there)[int(np.ceil(361 * 0.9)) - 1] / 1.6448536)
+    assert found.raw["90"] == pytest.approx(np.mean(there <= 1.6448536))
+    assert found.raw["radius_95"] == pytest.approx(np.mean(reaches[np.isfinite(reaches)] <= 1))
+    assert widened.coordinates["90"] == pytest.approx(np.sort(there)[int(np.ceil(361 * 0.9)) - 1] / 1.6448536)
     stretched = coverage(scores, [widened] * 80)
     assert stretched is not None and stretched.stretched is not None
-    assert stretched.stretched[1] == pytest.approx(0.9, abs=0.01)
+    assert stretched.stretched["90"] == pytest.approx(0.9, abs=0.01)
 
 
 def test_a_tracker_that_saw_nothing_says_nothing() -> None:

@@ -45,7 +45,7 @@ def test_mean_errors_over_all_poses_are_the_published_ones(
     assert told["error_mm"]["nominal"]["train"]["mean"] == pytest.approx(27.949, abs=0.001)
     assert told["error_mm"]["nominal"]["train"]["max"] == pytest.approx(60.30, abs=0.01)
     assert told["error_mm"]["calibrated"]["train"]["mean"] == pytest.approx(PUBLISHED_MEAN_MM[option], abs=0.01)
-    assert told["parameters"]["free"] == told["parameters"]["determined"] == FREE[option]
+    assert told["parameters"]["free"] == told["parameters"]["rank"] == FREE[option]
 
 
 @pytest.mark.parametrize(("option", "usable"), [(1, True), (2, False)])

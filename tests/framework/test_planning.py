@@ -8,7 +8,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 from armcal.errors import ProblemError
-from armcal.planning.candidates import Candidates, deviations, value_of, whitened_rows
+from armcal.estimate.identifiability import deviations
+from armcal.planning.candidates import Candidates, value_of, whitened_rows
 from armcal.planning.exchange import Tally, built_up, choose, detmax, in_order
 from armcal.planning.relaxation import AT_ONCE, Task
 

@@ -212,8 +212,8 @@ def test_stretched_intervals_hold_their_share_of_other_records_where_errors_are_
     for _ in range(200):
         found = stretch(_scores(random, 100, heavy=True))
         judged = coverage(_scores(random, 100, heavy=True), [found] * 100)
-        raw.append(judged.raw)
-        stretched.append([*judged.stated, judged.stretched_radius])
+        raw.append([judged.raw[level] for level in ("50", "90", "95")])
+        stretched.append(list(judged.stretched.values()))
     assert np.abs(np.mean(raw, axis=0) - LEVELS).max() > 0.05
     assert np.abs(np.mean(stretched, axis=0) - [*LEVELS, 0.95]).max() < 0.015
 
@@ -234,7 +234,7 @@ def test_a_stretch_of_a_level_is_a_rank_of_the_scores() -> None:
     errors = np.arange(1.0, 100.0)[None]
     found = stretch(Scores(errors, errors / 7, np.full(99, 1e9)))
     normal = [0.6744898, 1.6448536, 1.959964]
-    assert np.allclose(np.array(found.coordinates) * normal, [50, 90, 95], rtol=1e-5)
+    assert np.allclose(np.array(list(found.coordinates.values())) * normal, [50, 90, 95], rtol=1e-5)
     assert found.radius == pytest.approx(95 / 7)
 
 
@@ -252,7 +252,7 @@ def test_neighbours_that_err_together_are_worth_less() -> None:
     ("share", "worth", "grade"), [(0.9, 100, "good"), (0.84, 50, "good"), (0.84, 500, "warning"), (0.97, 500, "note")]
 )
 def test_the_verdict_on_intervals_is_a_test_at_five_percent(share: float, worth: float, grade: str) -> None:
-    found = coverage_finding(Coverage(300, 900, (0.5, share, 0.95), None, None, None, worth), "held-out records")
+    found = coverage_finding(Coverage(300, 900, {"50": 0.5, "90": share, "95": 0.95}, None, worth), "held-out records")
     assert found.grade == grade and f"{100 * share:.1f} %" in found.text and f"{worth} independent" in found.test
 
 
@@ -476,5 +476,5 @@ def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
 def test_on_the_real_arm_ninety_percent_intervals_hold_ninety_percent() -> None:
     found = calibrate(Experiment.load(CONFIGS / "option1.yaml", data=MEASURED)).intervals.crossed["same"]
     assert found.coordinates == 939
-    assert 0.87 <= found.stated[LEVELS.index(0.9)] <= 0.93
-    assert 0.93 <= found.stretched_radius <= 0.97
+    assert 0.87 <= found.stated["90"] <= 0.93
+    assert 0.93 <= found.stretched["radius_95"] <= 0.97

@@ -93,7 +93,11 @@ def test_of_a_linear_problem_it_is_the_interval_of_the_curvature(priors: str) ->
     made = lab("arm.mdh.base_[xyz]", 20, {"arm.mdh.base_x": 0.0465}, (priors,) if priors else ())
     estimate, found = profiled_once(made, made.records(np.random.default_rng(1), 2e-3), "arm.mdh.base_x")
     expected, sd = estimate.intervals[0], estimate.deviations[0]
-    assert (found.lower_end, found.upper_end) == ("crossed", "crossed") and not found.better and not found.failed
+    assert (
+        (found.lower_end, found.upper_end) == ("crossed", "crossed")
+        and not found.better_fit_found
+        and not found.failed_fits
+    )
     assert abs(found.lower - expected.lower) < 4e-3 * sd
     assert abs(found.upper - expected.upper) < 4e-3 * sd
     rises = ((found.curve[0] - found.value) / sd) ** 2
@@ -158,7 +162,7 @@ def test_a_fit_that_fails_leaves_its_end_open() -> None:
     place = made.problem.parameters.entries_of("arm.mdh.base_x").start
     limit = estimate.values[place] + 0.1 * estimate.deviations[0]
     _, found = profiled_once(made, records, "arm.mdh.base_x", Fails(place, float(limit)))
-    assert found.upper_end == "open" and found.lower_end == "crossed" and found.failed == 1
+    assert found.upper_end == "open" and found.lower_end == "crossed" and found.failed_fits == 1
     assert found.upper <= limit
 
 

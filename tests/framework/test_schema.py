@@ -25,7 +25,7 @@ RECORDED = ROOT / "tests" / "data" / "schema.json"
 # Mappings whose keys are names of parameters, groups, joints, designs, libraries, and not of the format.
 NAMED = re.compile(
     r"groups|profile|bootstrap\.parameters|noise\.scatter|seconds|provenance\.(versions|plugins)|excitation_rad_or_m"
-    r"|expected_sd|minimal\.sd_ordinary_sizes|designs(\.\*\.areas(\.\*\.quantities)?)?|holding_Nm|candidates\.left_out"
+    r"|expected_sd|(parameters\.)?determined_by|minimal\.sd_ordinary_sizes|designs(\.\*\.areas(\.\*\.quantities)?)?|holding_Nm|candidates\.left_out"
     r"|half_width_90|summary(\.\*)?|frames"
 )
 SLOW = ("run, poses of a camera", "study", "study, grouped", "capability", "acquire, dry")

@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import planted_mistakes
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.cli.check import gravity_lines
 from armcal.cli.main import cli
 from armcal.diagnose.data import find_permuted_axes
 from armcal.diagnose.fit import Prepared
-from armcal.estimate.start import Start, aligned_start, placings
+from armcal.estimate.start import aligned_start, placings
 from armcal.problem.rigid_alignment import Alignment, Tools, alignments, hand_eye, sighting_of, tools_of, undetermined
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble
@@ -199,18 +197,6 @@ def test_check_prints_where_the_base_stands(tmp_path: Path) -> None:
     checked = CliRunner().invoke(cli, ["check", str(DEMO), "--set", free, "--set", "evaluator=interpreted"])
     assert checked.exit_code == 0, checked.output
     assert "its base frame stands at (" in checked.stdout and "starts from the configuration" in checked.stdout
-
-
-def test_gravity_meant_in_the_base_frame_is_said_in_that_of_a_tilted_tracker() -> None:
-    """A base that stands rolled by a right angle in the tracker's frame: its -z is y there."""
-    turned = Alignment(Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.zeros(3), np.zeros(3), 1e-3)
-    arm, environment = SimpleNamespace(deflection_size=1), SimpleNamespace(gravity=(0.0, 0.0, -9.81))
-    system = SimpleNamespace(arms={"arm": arm}, environment=environment)
-    data = SimpleNamespace(has=lambda channel: False)
-    (line,) = gravity_lines(system, SimpleNamespace(start=Start(None, alignment=turned), dataset=data))
-    assert "pulls along (0.00, -9.81, 0.00) in the base frame" in line and "[0.00, 9.81, 0.00]" in line
-    level = replace(turned, turn=Rotation.from_euler("z", 1.0).as_matrix())
-    assert gravity_lines(system, SimpleNamespace(start=Start(None, alignment=level), dataset=data)) == []
 
 
 def hobby(dataset: Dataset, random: np.random.Generator) -> Dataset:

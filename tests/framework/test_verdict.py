@@ -207,9 +207,10 @@ def test_what_priors_alone_hold_is_a_note_where_the_tip_does_not_depend_on_it(tm
     freed = "parameters.free=[arm.mdh.alpha6, arm.mdh.tool_rx, arm.mdh.tool_z, arm.mdh.theta2, arm.mdh.base_z]"
     priors = 'parameters.priors={"*.alpha6": 2 deg, "*.tool_rx": 2 deg}'
     run = verdict(tmp_path / "run", freed, priors, "validation.folds=0")
-    found = next(f for f in run["verdict"]["findings"] if "determined by priors alone" in f["text"])
+    found = next(f for f in run["verdict"]["findings"] if "held by priors" in f["text"])
     assert found["grade"] == "note" and "does not depend on them" in found["text"]
-    assert len(found["text"]) < 200 and "armcal identify" in found["action"]
+    assert found["text"].startswith("The data determines 3 of 5 free parameters; held by priors: arm.mdh.alpha6, ")
+    assert len(found["text"]) < 300 and "armcal identify" in found["action"]
     assert run["structure"]["priors_alone"]["worst_mm"] < 1e-6
 
 

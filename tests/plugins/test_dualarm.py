@@ -121,7 +121,7 @@ def test_shared_sockets_tell_where_the_arms_stand_to_each_other(in_sockets):
     assert np.isnan(data.channels["left.q1"]).sum() == np.isnan(data.channels["right.q1"]).sum() == len(data) / 2
     assert max(apart(by_hand(in_sockets, data), true)) < 1e-7, "the simulated postures are not in the sockets"
     found = in_sockets.fit(data)
-    assert found.verdict.converged and all(found.identified_by_data)
+    assert found.verdict.converged and {*found.determined_by} == {"data"}
     assert found.identifiability.rank == 6 + 3 * len(SOCKETS)
     # Priors of a millimetre pull a little, against joints that are believed to a tenth of a milliradian.
     assert max(apart(pose_of(found), true)) < 2e-5
@@ -163,7 +163,7 @@ def test_records_that_only_one_arm_takes_part_in_run_from_a_file(in_sockets, tmp
     assert told["solver"]["converged"] and told["records"]["used"] == 2 * 8 * len(SOCKETS)
     true = dict(zip(in_sockets.problem.parameters.entry_names, in_sockets.true_values, strict=True))
     assert all(abs(kept[n]["value"] - true[n]) < 4.5 * kept[n]["sd"] for n in kept)
-    assert set(PLACEMENT) <= {n for n, p in kept.items() if p["determined"]}
+    assert set(PLACEMENT) <= {n for n, p in kept.items() if p["determined_by"] == "data"}
     assert told["noise"]["scale"] == pytest.approx(1, abs=0.2)
     assert not told["structure"]["residual_structure"]["structures"]
     if settings:
@@ -183,7 +183,7 @@ def test_sockets_of_their_own_tell_nothing_of_the_placement(in_sockets):
     alone = Case(path)
     alone.__dict__["postures"] = in_sockets.postures
     found = alone.fit(in_sockets.records())
-    told = dict(zip(found.names, found.identified_by_data, strict=True))
+    told = {n: by == "data" for n, by in zip(found.names, found.determined_by, strict=True)}
     assert not any(told[name] for name in PLACEMENT)
     assert all(told[name] for name in told if name.startswith("touches."))
 
@@ -252,7 +252,7 @@ def test_closed_chains_and_tracked_points_in_one_file_give_what_neither_gives_al
     mixed_csv(mixed, 12)
     told, kept = ran(mixed, tmp_path, *still)
     assert told["records"]["used"] == 42 and told["solver"]["converged"]
-    assert told["parameters"]["undetermined"] == [] and all(p["determined"] for p in kept.values())
+    assert told["parameters"]["undetermined"] == [] and all(p["determined_by"] == "data" for p in kept.values())
     assert len(kept) == 7 + 7
     truth = dict(zip(mixed.problem.parameters.entry_names, mixed.true_values, strict=True))
     for name, p in kept.items():
@@ -264,8 +264,10 @@ def test_closed_chains_and_tracked_points_in_one_file_give_what_neither_gives_al
     # Without the tracker the last joint trades with the clamp; a prior is then what holds it.
     mixed_csv(mixed, 0)
     alone, kept = ran(mixed, tmp_path, 'parameters.priors={"left.poe.offset7": "0.05 rad"}')
-    assert "left.poe.offset7" in alone["parameters"]["held_by_priors"]
-    assert not kept["left.poe.offset7"]["determined"] and kept["left.poe.offset3"]["determined"]
+    assert (
+        alone["parameters"]["determined_by"]["left.poe.offset7"] == kept["left.poe.offset7"]["determined_by"] == "prior"
+    )
+    assert kept["left.poe.offset3"]["determined_by"] == "data"
 
 
 @pytest.mark.slow
@@ -316,7 +318,7 @@ def test_the_placement_trades_with_the_first_joint_of_each_arm_and_both_are_name
     turning = next(c for c in combinations if c & FIRST == {"right.poe.offset1"})
     assert turning == {"right.poe.offset1", "right.placement_rotation<rz>"}
     found = chained.fit(data)
-    told = dict(zip(found.names, found.identified_by_data, strict=True))
+    told = {n: by == "data" for n, by in zip(found.names, found.determined_by, strict=True)}
     assert {n for n in told if "offset" in n and not told[n]} == FIRST
 
 

@@ -10,7 +10,7 @@ import pytest
 from armcal.base.domains import Interval
 from armcal.errors import ProblemError
 from armcal.estimate.estimator import estimate
-from armcal.estimate.identifiability import analyse, require_solvable
+from armcal.estimate.identifiability import determined_by, identify_from, require_solvable
 from armcal.problem.problem import PosedProblem, Problem
 from armcal_cvxpy.estimator import CvxpyEstimator
 from armcal_ipopt.estimator import IpoptEstimator
@@ -438,8 +438,7 @@ def known_of(lrm, names):
     q, measured = simulated(oracle.nominal(), 60, 18)
     problem, records, start = posed(lrm, names, q, measured)
     triangle = problem.with_records(records).triangular_factor(start)
-    found = analyse(triangle, problem.parameters.scales(), problem.parameters.coordinate_names)
-    return found, problem, records, start
+    return identify_from(triangle, problem.parameters), problem, records, start
 
 
 def quick_and_slow(choices):
@@ -454,9 +453,9 @@ def test_a_planted_undetermined_combination_is_found_and_named(lrm, planted):
     assert len(found.undetermined) == 1
     assert {name for name, _ in found.undetermined[0].terms} == {oracle.armcal_name(n) for n in planted}
     assert found.rank == len(found) - 1
-    determined = dict(zip(found.names, found.determined, strict=True))
-    assert all(determined[oracle.armcal_name(n)] for n in COMPANY)
-    assert not any(determined[oracle.armcal_name(n)] for n in planted)
+    by = determined_by(found, problem.parameters, np.zeros(len(found)))
+    names = {oracle.armcal_name(n) for n in planted}
+    assert by == tuple("nothing" if n in names else "data" for n in found.names)
     with pytest.raises(ProblemError, match="does not determine 1"):
         require_solvable(problem.with_records(records), start)
 
@@ -466,7 +465,7 @@ def test_a_sound_choice_of_parameters_is_not_suspected(lrm, names):
     found, problem, records, start = known_of(lrm, tuple(dict.fromkeys((*names, *COMPANY))))
     assert found.undetermined == ()
     assert found.rank == len(found)
-    assert all(found.determined)
+    assert {*determined_by(found, problem.parameters, np.zeros(len(found)))} == {"data"}
     require_solvable(problem.with_records(records), start)
 
 
@@ -477,19 +476,18 @@ def test_two_planted_combinations_are_told_apart(lrm):
     assert named == {frozenset(oracle.armcal_name(n) for n in pair) for pair in expected}
 
 
-def test_a_prior_on_one_of_the_two_makes_the_problem_solvable_with_a_warning(lrm):
+def test_a_prior_on_one_of_the_two_makes_the_problem_solvable(lrm):
     q, measured = simulated(oracle.nominal(), 40, 19)
 
     def change(parameters):
         return parameters.replaced({"arm.mdh.d3": replace(parameters["arm.mdh.d3"], prior_sd=0.001)})
 
     problem, records, start = posed(lrm, ("d3", "after2_z"), q, measured, change)
-    warnings = require_solvable(problem.with_records(records), start)
-    assert any("arm.mdh.d3" in w and "arm.mdh.after2_z" in w for w in warnings)
+    assert require_solvable(problem.with_records(records), start) == ()
     answers = [fitted(problem, estimator(n).solve(problem.with_records(records), start)) for n in ESTIMATORS]
     np.testing.assert_allclose(*answers, rtol=0, atol=1e-7)  # a ten thousandth of the prior's deviation
     found = estimate(problem.with_records(records), estimator("ipopt").solve(problem.with_records(records), start))
-    assert found.determined == (True, True)
+    assert found.determined_by == ("prior", "prior")
 
 
 def test_fewer_equations_than_parameters_are_refused(lrm):

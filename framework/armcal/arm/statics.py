@@ -153,6 +153,14 @@ class Environment:
         return Load.of([ca.SX(number) for number in self.acting])
 
 
+SAG_RAD = 0.002  # What a joint plausibly gives under half the moment that its arm's whole weight has at full reach
+
+
+def plausible_compliance(load_Nm: float) -> float:
+    """Of a joint (rad/(N m)) whose arm's whole weight has this moment at full reach."""
+    return SAG_RAD / (0.5 * load_Nm)
+
+
 def gravity_tilt() -> tuple[ParameterBlock, ...]:
     """How the real gravity is turned from the stated one, about the base frame's x and y axes (rad)."""
     return tuple(scalar(f"{STATICS}.gravity_{axis}", "rad", 0.0, 0.02) for axis in ("rx", "ry"))

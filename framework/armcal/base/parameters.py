@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from armcal.base.arrays import Array, Indices
-from armcal.base.domains import Domain, Interval, Rotation
+from armcal.base.domains import Domain, Interval, Pose, Rotation, ScrewAxis
 from armcal.base.units import SI_UNITS, UNITS, si_unit
 from armcal.errors import ConfigError
 from armcal.plugins import expecting, refuse
@@ -68,9 +68,12 @@ class ParameterBlock:
         return tuple(f"{self.name}[{suffix}]" if suffix else self.name for suffix in self.domain.entries)
 
     @property
-    def entry_unit(self) -> str:
-        """SI unit of its canonical entries: that of its increments, but for a quaternion's."""
-        return "1" if isinstance(self.domain, Rotation) else self.unit
+    def entry_units(self) -> tuple[str, ...]:
+        """The SI unit of each canonical entry; directions and quaternions have none."""
+        lengths = {Pose: "xyz", ScrewAxis: ("vx", "vy", "vz"), Rotation: ()}.get(type(self.domain))
+        if lengths is None:
+            return (self.unit,) * self.size
+        return tuple("m" if suffix in lengths else "1" for suffix in self.domain.entries)
 
     @property
     def size(self) -> int:

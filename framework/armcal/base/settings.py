@@ -3,7 +3,7 @@
 import difflib
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -202,6 +202,8 @@ def _as_config(value: Any) -> Any:
         return value.to_config()
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
+    if is_dataclass(value) and not isinstance(value, type):
+        return _as_config(asdict(value))
     if isinstance(value, Mapping):
         return {_as_config(key): _as_config(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):

@@ -145,22 +145,22 @@ class Calibration:
         if record.checks is None:
             return [*texts, f"keeps no check poses.{made_with}"] if changed else texts
         try:
-            moved = movement(self.system, self.parameters, record.checks)
+            tool_m, share, name = movement(self.system, self.parameters, record.checks)
         except (ArmcalError, ValueError) as fault:
             text = f"its check poses cannot be predicted any more ({fault})."
             raise ConfigError(f"{text}{made_with}", where=Location(str(path)), hint=_OTHER_PHYSICS) from fault
-        if moved.share > SHARE:
-            stated = f"{moved.name} by {moved.share:.2g} times its stated accuracy (limit {SHARE:g})"
-            if moved.name in record.checks.tools and record.checks.radius is None:
+        if share > SHARE:
+            stated = f"{name} by {share:.2g} times its stated accuracy (limit {SHARE:g})"
+            if name in record.checks.tools and record.checks.radius is None:
                 stated = f"no accuracy is stated for them (limit {UNSTATED_M * 1000:g} mm)"
             raise ConfigError(
                 f"the physics is another than when it was written: at its {len(record.checks.records)} check poses "
-                f"tools moved by up to {moved.tool_m * 1000:.3g} mm; {stated}.{made_with}",
+                f"tools moved by up to {tool_m * 1000:.3g} mm; {stated}.{made_with}",
                 where=Location(str(path)),
                 hint=_OTHER_PHYSICS,
             )
         if changed:
-            agree = f"predictions at its {len(record.checks.records)} check poses agree to {moved.tool_m * 1000:.1g} mm"
+            agree = f"predictions at its {len(record.checks.records)} check poses agree to {tool_m * 1000:.1g} mm"
             texts.append(f"was made with {'; '.join(changed)}; {agree}.")
         return texts
 
@@ -395,22 +395,13 @@ def _values(parameters: Parameters, record: CalibrationFile, path: str | Path, c
     return np.array(list(kept.values()))
 
 
-@dataclass(frozen=True)
-class Accepted:
-    """A calibration as it is accepted.
-
-    Attributes:
-        moved_m: how far tools at its check poses are from where they were predicted (m); None if it keeps none.
-    """
-
-    calibration: Calibration  # with a note of its acceptance and predictions at its check poses as they are now
-    was_edited: bool  # its content is not what armcal wrote
-    was_needed: bool  # false for one that is as armcal wrote it, with the same versions
-    moved_m: float | None
-
-
-def accept(path: Path, day: str, registry: PluginRegistry) -> Accepted:
+def accept(path: Path, day: str, registry: PluginRegistry) -> tuple[Calibration | None, bool, float | None]:
     """Check a calibration again in all but its hash, as of a day.
+
+    Returns:
+        it with a note of its acceptance and predictions at its check poses as they are now, None where it is as armcal
+        wrote it, with the same versions; whether its content was edited; and how far tools at its check poses are from
+        where they were predicted (m), None if it keeps none.
 
     Raises:
         ConfigError: it is no calibration, its parts do not fit one another, or a value is outside of its interval.
@@ -432,7 +423,7 @@ def accept(path: Path, day: str, registry: PluginRegistry) -> Accepted:
         text = f"the arm cannot be predicted with it ({type(fault).__name__}: {fault})."
         raise ConfigError(text, where=where, hint="Undo the last edits, or run the calibration again.") from fault
     same = remade.record.model_copy(update={"accepted": loaded.record.accepted}) == loaded.record
-    return Accepted(remade, not is_whole, not (is_whole and same), moved)
+    return None if is_whole and same else remade, not is_whole, moved
 
 
 def _check_values(record: CalibrationFile, source: ConfigSource) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from armcal.base.config_text import finite, plain
 from armcal.base.settings import Settings
@@ -18,6 +18,7 @@ from armcal.config.yaml_nodes import needs_quotes
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError, Location
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.identifiability import DeterminedBy
 
 SCHEMA = 1
 UNMOVED_SD = 1e-4
@@ -32,9 +33,8 @@ _LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 class ParameterRecord(Settings):
     """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known.
 
-    ``determined`` is by the records alone; what they do not determine may be held by a prior, and is no finding.
-    ``unconstrained`` is where the records would have it if no bound held any parameter, where that differs: who goes on
-    from the calibration needs it, for a bound is no evidence.
+    ``determined_by`` is null where it is fixed. ``unconstrained`` is where the records would have it if no bound held
+    any parameter, where that differs: who goes on from the calibration needs it, for a bound is no evidence.
     """
 
     name: str
@@ -45,10 +45,20 @@ class ParameterRecord(Settings):
     sd: float | None = None
     lower: float | None = None
     upper: float | None = None
-    determined: bool | None = None
-    held_by_prior: bool = False
+    determined_by: DeterminedBy | None = None
     at_bound: bool = False
     unconstrained: float | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_before(cls, record: Any) -> Any:
+        """Earlier versions wrote two fields: whether the data determine it, and whether a prior holds it."""
+        if isinstance(record, dict) and "determined" in record:
+            by_data, by_prior = record["determined"], record.get("held_by_prior")
+            by = None if by_data is None else "data" if by_data else "prior" if by_prior else "nothing"
+            record = {k: v for k, v in record.items() if k not in ("determined", "held_by_prior")}
+            record["determined_by"] = by
+        return record
 
 
 class InformationRecord(Settings):
@@ -105,7 +115,7 @@ def identity_of(description: Mapping[str, Any]) -> str:
 def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
     """Every canonical entry of an estimate."""
     parameters, nominal = estimate.parameters, estimate.parameters.nominal()
-    units = [block.entry_unit for block in parameters.blocks for _ in block.entry_names]
+    units = [unit for block in parameters.blocks for unit in block.entry_units]
     place = {name: i for i, name in enumerate(estimate.names)}
     records = []
     for position, name in enumerate(parameters.entry_names):
@@ -116,8 +126,7 @@ def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
                 "sd": finite(sd),
                 "lower": finite(float(interval.lower)),
                 "upper": finite(float(interval.upper)),
-                "determined": estimate.identified_by_data[i],
-                "held_by_prior": estimate.determined[i] and not estimate.identified_by_data[i],
+                "determined_by": estimate.determined_by[i],
                 "unconstrained": free if abs(free - estimate.values[position]) > UNMOVED_SD * sd else None,
             }
         records.append(

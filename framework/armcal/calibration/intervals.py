@@ -25,7 +25,6 @@ from armcal.config.system import System
 from armcal.diagnose.coverage import Stretch, level_name
 from armcal.errors import DataError
 from armcal.estimate.prediction import (
-    LEVELS,
     POSITION,
     STATED,
     TURN,
@@ -46,18 +45,10 @@ _FORGOTTEN = 5.0  # So many correlation distances beyond the recording nothing i
 _DIGITS = 12
 
 
-class DriftRecord(Settings):
-    """How a parameter drifts: standard deviation in its SI unit, distance in units of the channel."""
-
-    sd: float
-    over: float
-    channel: str
-
-
 class RecordingRecord(Settings):
     """The records that tell of a drift (SI, a row a record), and their weights (a row a measurement; none for ones)."""
 
-    drifts: dict[str, DriftRecord]
+    drifts: dict[str, Drift]
     channels: tuple[str, ...]
     records: tuple[tuple[float, ...], ...]
     weights: tuple[tuple[float, ...], ...] = ()
@@ -65,13 +56,6 @@ class RecordingRecord(Settings):
     @property
     def dataset(self) -> Dataset:
         return Dataset.of_rows(self.channels, self.records, "the recording that the calibration keeps")
-
-
-class StretchRecord(Settings):
-    """What half widths and radii are multiplied by: one number a level, one for 95 % radii."""
-
-    coordinates: dict[str, float]
-    radius: float | None = None
 
 
 class PredictionRecord(Settings):
@@ -83,7 +67,7 @@ class PredictionRecord(Settings):
 
     entries: tuple[str, ...]
     covariance: tuple[tuple[float, ...], ...]
-    stretches: dict[Literal["same", "new"], StretchRecord] = Field(default_factory=dict)
+    stretches: dict[Literal["same", "new"], Stretch] = Field(default_factory=dict)
     columns: dict[str, str] = Field(default_factory=dict)
     recording: RecordingRecord | None = None
     ranges: dict[str, tuple[float, float]] = Field(default_factory=dict)
@@ -134,16 +118,6 @@ class PlusMinus:
     unknown: Array | None = None
 
 
-def stretch_records(stretches: Mapping[Recording, Stretch]) -> dict[Literal["same", "new"], StretchRecord]:
-    return {
-        name: StretchRecord(
-            coordinates={level_name(p): x for p, x in zip(LEVELS, stretch.coordinates, strict=True)},
-            radius=stretch.radius,
-        )
-        for name, stretch in stretches.items()
-    }
-
-
 def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(f"{x:.{_DIGITS}g}") for x in row[: i + 1]) for i, row in enumerate(covariance))
 
@@ -156,7 +130,7 @@ def recording_record(problem: Problem, dataset: Dataset) -> RecordingRecord | No
     weights = [factor_records.weight[: factor_records.count] for factor_records in problem.records]
     weighed = any(np.any(weight != 1) for weight in weights)
     return RecordingRecord(
-        drifts={name: DriftRecord(sd=d.sd, over=d.over, channel=d.channel) for name, d in drifts.items()},
+        drifts=drifts,
         channels=tuple(dataset.channels),
         records=tuple(tuple(row) for row in dataset.stacked(tuple(dataset.channels)).T.tolist()),
         weights=tuple(tuple(w.tolist()) for w in weights) if weighed else (),
@@ -275,9 +249,7 @@ class Uncertainty:
     def _problem(self, dataset: Dataset) -> Problem:
         system, recording = self.system, self.record.recording
         drifts = {} if recording is None else recording.drifts
-        drifting = self.parameters.replaced(
-            {n: replace(self.parameters[n], drift=Drift(d.sd, d.over, d.channel)) for n, d in drifts.items()}
-        )
+        drifting = self.parameters.replaced({n: replace(self.parameters[n], drift=d) for n, d in drifts.items()})
         parts = (system.arms, system.measurements, drifting, system.environment, dataset)
         return Problem.build(*parts, "interpreted", groups={})
 
@@ -325,7 +297,7 @@ class _Part:
 
 
 def _joined(
-    problem: Problem, parts: Sequence[_Part], count: int, stretches: Mapping[Literal["same", "new"], StretchRecord]
+    problem: Problem, parts: Sequence[_Part], count: int, stretches: Mapping[Literal["same", "new"], Stretch]
 ) -> PlusMinus:
     plus_minus = PlusMinus({}, {}, {}, {})
     for place, kernel in enumerate(problem.kernels):

@@ -43,7 +43,7 @@ def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dic
         number = stated.get(entry.name, int(match[2]) if match and entry.unit == "rad" else 0)
         if not number or (joint := chosen.joint_names[number - 1]) not in chosen.commanded:
             continue
-        if entry.free and (entry.sd is None or not entry.determined):
+        if entry.free and (entry.sd is None or entry.determined_by != "data"):
             reasons[joint] = f"the records do not determine {entry.name}"
             continue
         value = entry.value if entry.name in stated else entry.value - entry.nominal

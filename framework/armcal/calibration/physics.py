@@ -7,7 +7,6 @@ explain what they find.
 import hashlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -66,15 +65,6 @@ class CheckRecord(Settings):
     @property
     def commands(self) -> Dataset:
         return Dataset.of_rows(self.channels, self.records, "the check poses")
-
-
-@dataclass(frozen=True)
-class Movement:
-    """How far predictions at check poses are from what they were."""
-
-    tool_m: float  # the farthest that a tool's position moved, or a point 1 m from it by its rotation (m)
-    share: float  # the largest movement of a channel or tool, in units of what is stated for it
-    name: str  # of that channel or arm
 
 
 def readable(system: System) -> Mapping[str, Measurement]:
@@ -211,8 +201,11 @@ def under_load(kept: CheckRecord, environment: Environment) -> CheckRecord:
     return kept.model_copy(update={"channels": (*kept.channels, *silent), "records": records})
 
 
-def movement(system: System, parameters: Parameters, kept: CheckRecord) -> Movement:
+def movement(system: System, parameters: Parameters, kept: CheckRecord) -> tuple[float, float, str]:
     """How far predictions at the check poses are from those that are kept.
+
+    The farthest that a tool moved (m), or a point 1 m from it by its rotation; the largest movement of a channel or
+    tool, in units of what is stated for it; and the name of that channel or arm.
 
     Raises:
         NotConvergedError: a record has no equilibrium now.
@@ -230,7 +223,7 @@ def movement(system: System, parameters: Parameters, kept: CheckRecord) -> Movem
             after = channels.get(name, np.full(len(kept.records), np.nan))
             shares[name] = float(np.abs(after - kept.predicted[name]).max()) / width
     worst = max(shares, key=lambda name: np.inf if np.isnan(shares[name]) else shares[name])
-    return Movement(tool_m, float(np.nan_to_num(shares[worst], nan=np.inf)), worst)
+    return tool_m, float(np.nan_to_num(shares[worst], nan=np.inf)), worst
 
 
 def _source(module: str) -> str:

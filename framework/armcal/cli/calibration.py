@@ -25,13 +25,13 @@ def accept(console: Console, path: Path) -> None:
     All but its hash is checked again. The acceptance is noted in FILE, and every command that uses it says so.
     """
     registry = console.registry()
-    record = accepted(path, datetime.now(UTC).date().isoformat(), registry)
-    if record.was_needed:
-        write_over({path.resolve(): sealed(record.calibration.record.to_config()).encode()})
-    moved = None if record.moved_m is None else record.moved_m * 1000
-    console.result({"file": str(path), "edited": record.was_edited, "moved_mm": moved})
+    noted, was_edited, moved_m = accepted(path, datetime.now(UTC).date().isoformat(), registry)
+    if noted is not None:
+        write_over({path.resolve(): sealed(noted.record.to_config()).encode()})
+    moved = None if moved_m is None else moved_m * 1000
+    console.result({"file": str(path), "edited": was_edited, "moved_mm": moved})
     moved_text = (
         "it keeps no check poses" if moved is None else f"tools at its check poses moved by up to {moved:.3f} mm"
     )
-    done = "accepted" if record.was_needed else "nothing to accept, it is as armcal wrote it"
+    done = "accepted" if noted is not None else "nothing to accept, it is as armcal wrote it"
     console.line(f"{done}: {path} ({moved_text})")

@@ -13,17 +13,22 @@ from armcal.arm.assembly import command_channels
 from armcal.base.units import digits, to_unit
 from armcal.cli.common import FILE, Console, data, overrides, speaking
 from armcal.cli.console import say
-from armcal.config.system import System
-from armcal.diagnose.data import gravity
 from armcal.diagnose.fit import Prepared
 from armcal.errors import ProblemError
-from armcal.estimate.identifiability import Identifiability, identify, require_solvable
+from armcal.estimate.identifiability import (
+    DETERMINED_BY,
+    POOR_CONDITION,
+    determined_in_words,
+    expected_sources,
+    identify_from,
+    require_solvable,
+)
 from armcal.estimate.start import Start, pose_words
+from armcal.problem.variants import factor_at_zero
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble
 
 _MM = 1000.0
-_TILTED = 0.05  # Of gravity: what changes by less where the base was found is not worth a line
 
 
 @click.command()
@@ -37,18 +42,14 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     experiment = Experiment.load(config, overrides, data, registry)
     with console.progress() as progress:
         ready = assemble(experiment, Stopwatch(), progress=progress)
-    start = ready.problem.parameters.nominal()
-    known = identify(ready.training, start)
-    refused: ProblemError | None = None
+    start, refused = ready.problem.parameters.nominal(), None
     try:
         ready = replace(ready, warnings=(*ready.warnings, *require_solvable(ready.training, start)))
     except ProblemError as fault:
         refused = fault
-    texts = [f"{finding.text} {finding.action}" for finding in gravity(ready)]
-    ready = replace(ready, warnings=(*ready.warnings, *texts))
-    for text in ready.warnings:
+    for text in ready.notices:
         console.warn(text)
-    content = _content(experiment, ready, known)
+    content = _content(experiment, ready)
     if refused:
         content["error"] = {"message": str(refused), "exit_code": refused.exit_code}
     console.result(content)
@@ -60,16 +61,22 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
     )
     rows = _excitation(experiment, content["excitation_rad_or_m"])
     console.table("Excitation of the joints", ("joint", "from", "to", "unit", "levels"), rows)
-    for line in (*_alignment_lines(ready.start), *gravity_lines(experiment.system, ready)):
+    notes = (f"{finding.text} {finding.action}" for finding in ready.findings if finding.grade == "note")
+    for line in (*_alignment_lines(ready.start), *notes):
         out.print(line, soft_wrap=True)
     condition = parameters["scaled_condition"]
     shown = "infinite" if condition is None else f"{condition:.3g}"
-    out.print(f"rank {parameters['rank']} of {len(parameters['free'])}, scaled condition {shown}.")
+    words = determined_in_words(parameters["determined_by"])
+    out.print(
+        f"{words} (rank {parameters['rank']} of {len(parameters['free'])}, scaled condition {shown}).", soft_wrap=True
+    )
     if parameters["weakest"]:
-        out.print(f"least determined: {parameters['weakest']}.")
+        hardly = "hardly" if condition is None or condition > POOR_CONDITION else "least"
+        out.print(f"{hardly} determined: {parameters['weakest']}.")
     if console.verbose:
         for name in parameters["all"]:
-            out.print(f"  {'free ' if name in parameters['free'] else 'fixed'} {name}")
+            by = parameters["determined_by"].get(name)
+            out.print(f"  {DETERMINED_BY[by] if by else 'fixed':<{max(map(len, DETERMINED_BY.values()))}} {name}")
     if refused:
         say(f"armcal: {refused}", err=True)
         sys.exit(refused.exit_code)
@@ -85,10 +92,13 @@ def _excitation(experiment: Experiment, excitation: dict[str, Any]) -> Iterator[
         yield joint, low, high, units[joint], seen["levels"]
 
 
-def _content(experiment: Experiment, ready: Prepared, known: Identifiability) -> dict[str, Any]:
+def _content(experiment: Experiment, ready: Prepared) -> dict[str, Any]:
+    parameters = ready.problem.parameters
+    triangle = factor_at_zero(ready.training, parameters.nominal())
+    known = identify_from(triangle, parameters)
     channels = [*command_channels(experiment.system.arms)]
     angles = {channel: ready.dataset.column(channel)[ready.split.train] for channel in channels}
-    every = ready.problem.parameters.with_free(ready.problem.parameters.names)
+    every = parameters.with_free(parameters.names)
     return {
         "experiment": experiment.name,
         "records": {
@@ -101,6 +111,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
         "parameters": {
             "all": list(every.coordinate_names),
             "free": list(known.names),
+            "determined_by": expected_sources(known, parameters, triangle),
             "rank": known.rank,
             "scaled_condition": known.condition if np.isfinite(known.condition) else None,
             "undetermined": [str(combination) for combination in known.undetermined],
@@ -111,7 +122,7 @@ def _content(experiment: Experiment, ready: Prepared, known: Identifiability) ->
             for channel, values in angles.items()
         },
         "alignment": _alignment(ready.start),
-        "warnings": list(ready.warnings),
+        "warnings": list(ready.notices),
     }
 
 
@@ -145,19 +156,3 @@ def _alignment_lines(start: Start) -> list[str]:
     ]
     lines += [f"not determined by these positions: {gauge}." for gauge in start.gauges]
     return lines
-
-
-def gravity_lines(system: System, ready: Prepared) -> list[str]:
-    """How gravity pulls an arm with springs that was found tilted: it is stated in the frame of the measurements."""
-    alignment = ready.start.alignment
-    if alignment is None or ready.dataset.has("gravity_z") or not any(a.deflection_size for a in system.arms.values()):
-        return []
-    stated = np.array(system.environment.gravity)
-    inside, meant = alignment.turn.T @ stated, alignment.turn @ stated
-    if np.linalg.norm(inside - stated) < _TILTED * np.linalg.norm(stated):
-        return []
-    shown = [", ".join(f"{x:.2f}" for x in np.round(vector, 2) + 0.0) for vector in (stated, inside, meant)]
-    return [
-        f"gravity, ({shown[0]}) m/s^2 in the instrument's frame, pulls along ({shown[1]}) in the base frame that was "
-        f"found there. If it was meant in the base frame, state statics.gravity_m_s2: [{shown[2]}]."
-    ]

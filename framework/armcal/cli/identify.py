@@ -17,14 +17,16 @@ from armcal.errors import ConfigError, Location
 from armcal.estimate.identifiability import (
     CAUSES,
     CORRELATED,
+    DETERMINED_BY,
     Combination,
     Dropped,
     Identifiability,
     Measure,
     correlated_pairs,
+    determined_in_words,
     expected_covariance,
+    expected_sources,
     explain,
-    held_by_nothing,
     identify_from,
     minimal_set,
 )
@@ -87,7 +89,7 @@ def identify(
         with console.progress() as progress:
             judged = fixed_parameters(experiment.of_records(ready.dataset), ready, progress)
         content["fixed"] = asdict(judged)
-    for text in ready.warnings:
+    for text in ready.notices:
         console.warn(text)
     console.result(content)
     _show(console, content)
@@ -120,16 +122,15 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
         "records": len(ready.split.train),
         "equations": equations,
         "free": list(known.names),
+        "determined_by": expected_sources(known, parameters, triangle),
         "rank": known.rank,
         "rank_by_qr": known.rank_by_qr,
         "singular_values": [float(value) for value in known.singular_values],
         "scaled_condition": known.condition if np.isfinite(known.condition) else None,
         "observability_of_the_determined": indices,
         "undetermined": [
-            {**_terms(undetermined.combination), "cause": undetermined.cause, "priors": list(undetermined.priors)}
-            for undetermined in explained
+            {**_terms(undetermined.combination), "cause": undetermined.cause} for undetermined in explained
         ],
-        "held_by_nothing": [_terms(combination) for combination in held_by_nothing(parameters, known)],
         "hardly_determined": [
             {**_terms(combination), "sd_ordinary_sizes": finite(sd)} for combination, sd in known.hardly
         ],
@@ -138,7 +139,7 @@ def _content(experiment: Experiment, ready: Prepared, triangle: Array, known: Id
             for one, other, r in correlated_pairs(covariance, parameters.coordinate_names)
         ],
         "expected_sd": {n: float(sd) if sd > 0 else None for n, sd in zip(known.names, deviation, strict=True)},
-        "warnings": list(ready.warnings),
+        "warnings": list(ready.notices),
     }
 
 
@@ -170,21 +171,10 @@ def _show(console: Console, content: dict[str, Any]) -> None:
         shown = ", ".join(f"{n.upper()} {v:.3g}" for n, v in content["observability_of_the_determined"].items())
         console.line(f"observability of {'them' if rank == free else f'the {rank} determined combinations'}: {shown}.")
     for cause, words in CAUSES.items():
-        determined = [
-            combination["text"]
-            + (f", held by the prior of {' and '.join(combination['priors'])}" if combination["priors"] else "")
-            for combination in content["undetermined"]
-            if combination["cause"] == cause
-        ]
-        _section(console, f"Undetermined, {words} ({len(determined)}):", determined)
-    unheld = content["held_by_nothing"]
-    if not content["undetermined"]:
-        console.line("No combination is undetermined.", "green")
-    elif not unheld:
-        console.line("Priors hold every undetermined combination: what they say of it is all that will be known.")
-    else:
-        title = f"Undetermined without a prior: armcal run refuses these ({len(unheld)}):"
-        _section(console, title, [combination["text"] for combination in unheld])
+        own = [one["text"] for one in content["undetermined"] if one["cause"] == cause]
+        _section(console, f"Undetermined, {words} ({len(own)}):", own)
+    refused = "; armcal run refuses them" if "nothing" in content["determined_by"].values() else ""
+    console.line(f"{determined_in_words(content['determined_by'])}{refused}.")
     hardly = [
         f"{pair['text']}: sd {pair['sd_ordinary_sizes'] or np.inf:.3g} typical scales"
         for pair in content["hardly_determined"]
@@ -194,7 +184,10 @@ def _show(console: Console, content: dict[str, Any]) -> None:
     _section(console, f"Correlated above {CORRELATED:g}:", pairs)
     if console.verbose:
         deviations = content["expected_sd"].items()
-        shown_sd = [f"{name}: {'undetermined' if sd is None else f'{sd:.3g}'}" for name, sd in deviations]
+        by = content["determined_by"]
+        shown_sd = [
+            f"{name}: {'' if sd is None else f'{sd:.3g}, '}{DETERMINED_BY[by[name]]}" for name, sd in deviations
+        ]
         _section(console, "Expected standard deviations by the declared noise and the priors (SI):", shown_sd)
 
 
@@ -208,7 +201,7 @@ def _show_minimal(console: Console, content: dict[str, Any]) -> None:
     _section(console, f"Left out as asked, though determined ({len(left_out)}):", left_out)
     within = sorted({name for name, sd in content["sd_ordinary_sizes"].items() if sd is None})
     _section(console, "Kept, and undetermined in part (these need priors):", within)
-    console.line(f"A minimal set of {len(content['kept'])}:", "bold")
+    console.line(f"A minimal set of {len(content['sd_ordinary_sizes'])} free parameters:", "bold")
     for text in ("parameters:", "  free:", *(f"    - {name}" for name in content["kept"])):
         console.line(text)
 

@@ -67,7 +67,7 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     console.result(content)
     for text in trial.result.warnings:
         console.warn(text)
-    console.line(f"{robot.name}: {len(robot.joints)} joints, {len(choice.kept)} free parameters, in {folder}")
+    console.line(f"{robot.name}: {len(robot.joints)} joints, {len(choice.deviations)} free parameters, in {folder}")
     if robot.name in SKELETONS and not (source.dh or source.urdf):
         console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
     assumed = [joint.name for joint in robot.joints if joint.assumed]

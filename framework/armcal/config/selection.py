@@ -140,7 +140,8 @@ def with_values(
                 hint=f"Give its entries, each on its own: {', '.join(block.entry_names)}.",
             )
         numbers = list(block.nominal)
-        numbers[block.entry_names.index(name)] = quantity(replace(block, unit=block.entry_unit), text, source, place)
+        i = block.entry_names.index(name)
+        numbers[i] = quantity(replace(block, unit=block.entry_units[i]), text, source, place)
         parameters = parameters.replaced({owner: replace(block, nominal=tuple(numbers))})
         changed[owner] = place
     for owner, place in changed.items():

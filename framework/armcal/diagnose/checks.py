@@ -72,11 +72,15 @@ DATA_CHECKS = (
     Check("reach", "Are all positions in one unit, and as far out as the arm reaches?", NO_RATE, "data.md",
           "data:reach"),
     Check("masses", "Does the arm weigh what an arm of its length may weigh?", NO_RATE, "models.md", "data:masses"),
+    Check("gravity", "Where springs bend: is gravity stated, in the frame of the measurements?", NO_RATE,
+          "calibrate.md", "data:gravity"),
 )  # fmt: skip
 """Of data before a fit."""
 
 FIT_CHECKS = (
     Check("converged", "Did the solver converge?", EXACT, "numbers.md", "verdict:converged"),
+    Check("before", "What did the checks of the data find, and what became of a pose residual?", EXACT,
+          "pose_residual.md", "verdict:found_before"),
     Check("determined", "Do the data determine all free parameters, and does the tip depend on the others?", EXACT,
           "identifiability.md", "unseen:determined"),
     Check("condition", "Is a combination of parameters hardly determined?", EXACT, "identifiability.md",
@@ -96,8 +100,6 @@ FIT_CHECKS = (
     Check("neighbours", "Do records that follow one another miss alike, and how much wider are intervals?", EXACT,
           "mathematics.md", "residual_structure:neighbours"),
     Check("correlated", "Which estimates correlate strongly?", EXACT, "identifiability.md", "verdict:correlated"),
-    Check("before", "What did the checks of the data find, and what became of a pose residual?", EXACT,
-          "pose_residual.md", "verdict:found_before"),
     Check("computed", "Do the tips come from the joints, not from an instrument?", NO_RATE, "data.md",
           "gross:computed"),
     Check("gross", "Is the error gross beside the arm's reach?", NO_RATE, "numbers.md", "gross:gross"),
@@ -125,7 +127,6 @@ FIT_CHECKS = (
     Check("moved", "Did what the arm touches move?", NO_RATE, "ball_and_sockets.md", "outliers:moved"),
     Check("still", "Did a joint stand still?", EXACT, "data.md", "data:still"),
     Check("same_poses", "Are held-out records at poses that trained?", EXACT, "numbers.md", "data:same_poses"),
-    Check("gravity", "Is the direction of gravity stated where springs bend?", EXACT, "effects.md", "data:gravity"),
     Check("large_errors", "Are unseen records missed by more than noise explains?", "1 %", "numbers.md",
           "outliers:missed"),
     Check("outliers", "Do training records lie farther off than noise allows?", "1 %", "noise.md",

@@ -19,6 +19,7 @@ from scipy.special import betainc
 from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
+from armcal.base.settings import Settings
 from armcal.base.units import readable
 from armcal.diagnose.causes import MOST_LEVELS
 from armcal.diagnose.checks import Finding
@@ -65,51 +66,40 @@ class Scores:
         return np.asarray(np.isfinite(self.errors).any(axis=0))
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """What half widths are multiplied by, one number a level, and what 95 % radii are (None without positions)."""
+class Stretch(Settings):
+    """What half widths are multiplied by, one number a level, and what 95 % radii are (None without positions).
 
-    coordinates: tuple[float, ...]
-    radius: float | None
+    A calibration keeps it as it is.
+    """
 
-    def as_dict(self) -> dict[str, float | None]:
-        named: dict[str, float | None] = {level_name(p): x for p, x in zip(LEVELS, self.coordinates, strict=True)}
-        return {**named, "radius_95": self.radius}
+    coordinates: dict[str, float]
+    radius: float | None = None
+
+
+Shares = dict[str, float | None]  # by level, and ``radius_95``: of positions within 95 % radii, None without positions
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares held.
+    """Shares held."""
 
-    Attributes:
-        records, coordinates: how many records and numbers were judged.
-        stretched, stretched_radius: the same by stretches of other records; None where there were too few.
-    """
-
-    records: int
-    coordinates: int
-    raw: tuple[float, ...]  # share within the intervals as computed, one a level of ``LEVELS``
-    raw_radius: float | None  # share of positions within 95 % radii; None without positions
-    stretched: tuple[float, ...] | None
-    stretched_radius: float | None
+    records: int  # that were judged
+    coordinates: int  # numbers that were judged
+    raw: Shares  # within the intervals as computed
+    stretched: Shares | None  # by stretches of other records; None where there were too few
     independent: float  # how many independent numbers the judged ones are worth
 
     @property
-    def stated(self) -> tuple[float, ...]:
+    def stated(self) -> Shares:
         return self.stretched or self.raw
 
     def as_dict(self) -> dict[str, object]:
-        def named(shares: tuple[float, ...] | None, radius: float | None) -> dict[str, float | None] | None:
-            if shares is None:
-                return None
-            return {**{level_name(p): x for p, x in zip(LEVELS, shares, strict=True)}, "radius_95": radius}
-
         return {
             "records": self.records,
             "coordinates": self.coordinates,
             "worth_independent": self.independent,
-            "share": named(self.stated, self.stretched_radius if self.stretched else self.raw_radius),
-            "share_without_stretch": named(self.raw, self.raw_radius),
+            "share": self.stated,
+            "share_without_stretch": self.raw,
             "stretched": self.stretched is not None,
         }
 
@@ -199,10 +189,10 @@ def stretch(scores: Scores) -> Stretch | None:
     judged = scores.judged
     if judged.sum() < FEWEST:
         return None
-    rank = [_ranked(scores.of_level(level)[:, judged].ravel(), level) for level in LEVELS]
+    rank = {level_name(level): _ranked(scores.of_level(level)[:, judged].ravel(), level) for level in LEVELS}
     reaches = scores.reaches[:, judged].ravel()
     radius = _ranked(reaches, RADIUS_LEVEL) if np.isfinite(reaches).any() else None
-    return Stretch(tuple(rank), radius)
+    return Stretch(coordinates=rank, radius=radius)
 
 
 def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) -> Coverage | None:
@@ -210,17 +200,16 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) 
     judged = np.flatnonzero(scores.judged)
     if not len(judged):
         return None
-    none = [Stretch((1.0,) * len(LEVELS), 1.0)] * len(scores.freedom)
-    raw, raw_radius = _shares(scores, none, judged)
+    none = [Stretch(coordinates={level_name(level): 1.0 for level in LEVELS}, radius=1.0)] * len(scores.freedom)
     own = list(stretches or ())
     known = bool(own) and all(own[i] is not None for i in judged)
-    shares, radius = _shares(scores, own, judged) if known else (None, None)
+    shares = _shares(scores, own, judged) if known else None
     held = _held(scores, own if known else none, STATED)[:, judged]
-    return Coverage(len(judged), int(np.isfinite(held).sum()), raw, raw_radius, shares, radius, _worth(held))
+    return Coverage(len(judged), int(np.isfinite(held).sum()), _shares(scores, none, judged), shares, _worth(held))
 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
-    share, raw = shares.stated[LEVELS.index(STATED)], shares.raw[LEVELS.index(STATED)]
+    share, raw = ((own[level_name(STATED)] or 0.0) for own in (shares.stated, shares.raw))
     within, beyond = share * shares.independent, (1 - share) * shares.independent
     few, many = betainc(max(beyond, 1e-9), within + 1, 1 - STATED), betainc(max(within, 1e-9), beyond + 1, STATED)
     off = min(few, many) < LEVEL / 2
@@ -245,19 +234,16 @@ def _ranked(scores: Array, level: float) -> float:
 
 def _held(scores: Scores, stretches: Sequence[Stretch | None], level: float) -> Array:
     """Whether each number lies within its interval (n_r x N): one, zero, or nan where there is none."""
-    place = LEVELS.index(level)
-    factors = np.array([np.nan if s is None else s.coordinates[place] for s in stretches])
+    factors = np.array([np.nan if s is None else s.coordinates[level_name(level)] for s in stretches])
     return _within(scores.of_level(level), factors)
 
 
-def _shares(
-    scores: Scores, stretches: Sequence[Stretch | None], judged: Indices
-) -> tuple[tuple[float, ...], float | None]:
-    shares = tuple(float(np.nanmean(_held(scores, stretches, level)[:, judged])) for level in LEVELS)
+def _shares(scores: Scores, stretches: Sequence[Stretch | None], judged: Indices) -> Shares:
+    shares: Shares = {level_name(p): float(np.nanmean(_held(scores, stretches, p)[:, judged])) for p in LEVELS}
     if not np.isfinite(scores.reaches[:, judged]).any():
-        return shares, None
+        return {**shares, "radius_95": None}
     radii = np.array([np.nan if s is None or s.radius is None else s.radius for s in stretches])
-    return shares, float(np.nanmean(_within(scores.reaches, radii)[:, judged]))
+    return {**shares, "radius_95": float(np.nanmean(_within(scores.reaches, radii)[:, judged]))}
 
 
 def _within(scores: Array, limits: Array) -> Array:
@@ -337,7 +323,7 @@ class IntervalResult:
             content[_NAMED[name]] = {
                 "half_width_90_mm": self.half_width_mm[name],
                 "radius_95_mm": self.radius_mm[name],
-                "stretch": self.stretches[name].as_dict() if name in self.stretches else None,
+                "stretch": {**own.coordinates, "radius_95": own.radius} if (own := self.stretches.get(name)) else None,
                 "cross_validated": self.crossed[name].as_dict() if name in self.crossed else None,
                 "holdout": self.holdout[name].as_dict() if name in self.holdout else None,
             }
@@ -439,7 +425,7 @@ def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> 
 def _typical(spreads: Sequence[Spread], widened: Stretch | None) -> tuple[float, float]:
     if not spreads:
         return float("nan"), float("nan")
-    factor = widened.coordinates[LEVELS.index(STATED)] if widened else 1.0
+    factor = widened.coordinates[level_name(STATED)] if widened else 1.0
     radius = widened.radius if widened and widened.radius is not None else 1.0
     half = np.concatenate([spread.half_widths(STATED).ravel() for spread in spreads])
     radii = np.concatenate([spread.radius() for spread in spreads])

@@ -20,8 +20,8 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
-from armcal.diagnose.checks import Finding, first_few
-from armcal.diagnose.fit import Fit, Prepared
+from armcal.diagnose.checks import Finding, Grade, first_few
+from armcal.diagnose.fit import Fit, Prepared, thinned
 from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.polish import descended
 from armcal.estimate.start import Placing, placings
@@ -660,6 +660,8 @@ _MEND = {
 }
 _STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}
 """A joint that moved by less stood still, but for the noise of its reading."""
+_ODD, _MUCH_LESS, _FAR_LIKELIER = 0.2, 1.4, np.log(1e3)
+"""Of gravity: by how much it is another where it is meant in the base frame; how much larger residuals are without."""
 _DENSEST, _SHORTEST = 200.0, 0.4
 """kg for each cubic metre of an arm's length (industrial arms and palletisers: 5 to 90); m, what shorter arms count."""
 
@@ -746,26 +748,57 @@ def same_poses(fit: Fit) -> list[Finding]:
     return [Finding("warning", text, "poses alike in all joints, under the same load", "Hold out other poses.")]
 
 
-def gravity(of: Prepared | Fit) -> list[Finding]:
-    """Whether springs bend under weights and the direction of gravity is not stated.
+def gravity(ready: Prepared) -> list[Finding]:
+    """Where springs bend under weights: whether gravity is stated, and in the frame of the measurements.
 
-    A tracker's frame may stand in any way: gravity that is turned with it makes wrong compliances, and fits as well.
+    A tracker's frame may stand in any way. Where the base as aligned stands tilted in it, short fits judge whether the
+    vector was meant in the base frame.
     """
-    system, dataset = of.system, of.dataset
-    if system.statics.gravity is not None or dataset.has("gravity_z"):
-        return []
+    system, dataset = ready.system, ready.dataset
     payload = bool(system.statics.payload) or (dataset.has("payload") and bool(dataset.column("payload").any()))
     bent = [name for name, arm in system.arms.items() if arm.deflection_size and (arm.masses or payload)]
-    if not bent:
+    if not bent or dataset.has("gravity_z"):
         return []
-    x, y, z = system.environment.gravity
-    text = (
-        f"The direction of gravity is not stated: for the springs of {', '.join(bent)} it was assumed to be "
-        f"({x:g}, {y:g}, {z:g}) m/s^2 in the frame of the measurements, z up. If that frame is tilted, compliances are "
-        "wrong."
-    )
-    action = (
-        "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and gravity_z_m_s2"
-        " to the records."
-    )
-    return [Finding("warning", text, action=action)]
+    stated, alignment = np.array(system.environment.gravity), ready.start.alignment
+    findings = [] if system.statics.gravity is not None else [_unstated(bent, stated)]
+    if alignment is None or np.linalg.norm(alignment.turn @ stated - stated) < _ODD * np.linalg.norm(stated):
+        return findings
+    inside, meant = alignment.turn.T @ stated, alignment.turn @ stated
+    try:
+        left, freedom = _left_under(ready, (stated, meant))
+    except NotConvergedError:
+        return findings
+    odds = freedom * np.log(left[0] / left[1])  # of two fits with noise of unknown size, in powers of e
+    if odds < -_FAR_LIKELIER:
+        return findings
+    as_stated, pull, to_state = (", ".join(f"{x:.2f}" for x in np.round(v, 2) + 0.0) for v in (stated, inside, meant))
+    text = f"Gravity, ({as_stated}) m/s^2 in the frame of the measurements, pulls along ({pull}) in the arm's base "
+    text += f"frame as aligned. Residuals of short fits are {digits(left[0], 2)} times the declared noise so, "
+    text += f"{digits(left[1], 2)} times where the vector is meant in the base frame."
+    likelier = odds > _FAR_LIKELIER
+    grade: Grade = "bad" if likelier and left[0] > _MUCH_LESS * left[1] else "warning" if likelier else "note"
+    action = f"{'State' if likelier else 'If it is meant so, state'} statics.gravity_m_s2: [{to_state}]."
+    return [*findings, Finding(grade, text, f"limits {_MUCH_LESS:g} times, and a thousand to one", action)]
+
+
+def _unstated(bent: Sequence[str], assumed: Array) -> Finding:
+    x, y, z = assumed
+    text = f"The direction of gravity is not stated: for the springs of {', '.join(bent)} it was assumed to be "
+    text += f"({x:g}, {y:g}, {z:g}) m/s^2 in the frame of the measurements, z up. If that frame is tilted, compliances "
+    action = "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and "
+    return Finding("warning", f"{text}are wrong.", action=f"{action}gravity_z_m_s2 to the records.")
+
+
+def _left_under(ready: Prepared, directions: Sequence[Array]) -> tuple[list[float], float]:
+    """What short fits leave under each gravity (3, m/s^2), in units of the declared noise; degrees of freedom."""
+    few = ready.trained.subset(thinned(np.arange(len(ready.trained))))
+    columns = [{f"gravity_{axis}": np.full(len(few), x) for axis, x in zip("xyz", g, strict=True)} for g in directions]
+    under = [replace(few, channels={**few.channels, **own}) for own in columns]
+    plan, parameters = ready.problem.blueprint, ready.problem.parameters
+    problem = Problem.build(plan.arms, plan.measurements, parameters, plan.environment, under[0], "interpreted")
+    freedom, left = max(problem.equations() - problem.increments, 1), []
+    for dataset in under:
+        posed = PosedProblem(problem.of(dataset))
+        x = descended(posed, posed.x(ready.start.values(problem)[0]), _FIT_STEPS, _FIT_DAMPING, 1e-3)
+        left.append(float(np.sqrt(2 * posed.cost(x) / freedom)))
+    return left, freedom

@@ -59,6 +59,12 @@ class Prepared:
     limit_mm: float | None = None  # from which on an error is to be explained; None: beyond what noise does
     limits: Mapping[str, Limits] = field(default_factory=dict)  # of joints, as a plan states them
 
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """The warnings, and those of the checks of data, for commands that have no verdict."""
+        texts = (f"{one.text} {one.action}".strip() for one in self.findings if one.grade in ("warning", "bad"))
+        return (*self.warnings, *texts)
+
     @cached_property
     def training(self) -> Problem:
         return self.problem.subset(self.split.train)

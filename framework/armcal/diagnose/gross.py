@@ -9,8 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation as Turns
 from scipy.special import stdtr, stdtrit
 
+from armcal.arm.statics import plausible_compliance
 from armcal.base.arrays import Array
 from armcal.base.domains import Pose, Rotation, ScrewAxis
+from armcal.base.parameters import Parameters
 from armcal.base.units import digits, readable
 from armcal.diagnose.checks import Finding, Grade, first_few
 from armcal.diagnose.fit import MOST_RECORDS, Fit, only_places, thinned, unconfigured
@@ -24,8 +26,9 @@ from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import FEWEST, hand_eye, rigid_fit, sighting_of, spread_of, tools, tools_of
 
 _MM = 1000.0
-BEYOND, FAR_BEYOND = 4.0, 20.0
-"""Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross."""
+BEYOND, FAR_BEYOND, IMPLAUSIBLE = 4.0, 20.0, 100.0
+"""Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross. Of
+what is no length or angle: how many times a plausible size is worth a look."""
 _POSES = 60
 _FEWEST_LENGTHS = 3
 AS_MUCH, BY_SHARES = 0.01, 0.05
@@ -38,8 +41,7 @@ class Displaced:
     amount: float  # how far, in ``unit``
     unit: str  # that people are shown
     times: float  # how many standard deviations of its prior, or typical corrections
-    by_prior: bool  # whether it has a prior
-    placement: bool  # whether it only moves where the base stands or which point of the tool is meant
+    by: str  # ``prior``; ``geometry``, or ``place`` of what only moves base or tool point; ``size`` of anything else
 
 
 @dataclass(frozen=True)
@@ -104,12 +106,13 @@ def figure(fit: Fit) -> Figure:
     chain = arm.nominal_chain
     first = np.array(ca.evalf((chain.base_T_mount @ chain.joints[0].parent_T_joint).translation)).ravel()
     extent, turn, shift = spread_of(bent), *rigid_fit(nominal, calibrated)
+    reach = float(np.max(np.linalg.norm(nominal - first[:, None], axis=0)))
     return Figure(
-        reach_mm=float(np.max(np.linalg.norm(nominal - first[:, None], axis=0))) * 1000.0,
+        reach_mm=reach * 1000.0,
         size=spread_of(calibrated) / extent if extent > 0 else float("nan"),
         moved_mm=float(np.linalg.norm(turn @ first + shift - first)) * 1000.0,
         turned_deg=float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))),
-        displaced=_displaced(poses, estimate),
+        displaced=_displaced(poses, estimate, reach),
         proportion=proportion(poses, estimate),
     )
 
@@ -126,27 +129,43 @@ def _places(problem: Problem, estimate: Estimate) -> tuple[Array, Array, Array]:
     return nominal, calibrated, bent_places
 
 
-def _displaced(problem: Problem, estimate: Estimate) -> tuple[Displaced, ...]:
-    """Coordinates of geometry that are more than ``BEYOND`` prior standard deviations from their nominal values.
+def _displaced(problem: Problem, estimate: Estimate, reach_m: float) -> tuple[Displaced, ...]:
+    """Coordinates that are too far from their nominal values for their priors, or for what is plausible without one.
 
     What nobody configured is nowhere far from.
     """
     parameters = problem.parameters
     moved = parameters.coordinates(parameters.local(estimate.values))
-    blocks = parameters.coordinate_blocks
-    # By its prior, else by a typical correction of a length or angle; of others nothing is known.
-    typical = [b.scale if b.unit in ("m", "rad") and not b.nuisance else np.inf for b in blocks]
-    sizes = np.array([t if b.prior_sd is None else b.prior_sd for b, t in zip(blocks, typical, strict=True)])
     far = []
-    for i in np.flatnonzero(np.abs(moved) > BEYOND * sizes):
-        block = blocks[i]
-        if unconfigured(problem, block.name):
+    for i, block in enumerate(parameters.coordinate_blocks):
+        name, geometric = parameters.coordinate_names[i], block.unit in ("m", "rad")
+        size, limit = block.prior_sd or block.scale, BEYOND if block.prior_sd or geometric else IMPLAUSIBLE
+        arm = problem.blueprint.arms.get(name.partition(".")[0])
+        mass = sum(own.mass for own in arm.masses) if arm else 0.0
+        load_Nm = float(reach_m * mass * np.linalg.norm(problem.blueprint.environment.gravity))
+        if limit == IMPLAUSIBLE and block.unit == "rad_per_Nm" and load_Nm > 0:
+            interval = estimate[name].interval
+            plausible = max(
+                plausible_compliance(load_Nm), _typical_compliance(parameters, estimate, name.partition(".")[0])
+            )
+            # An arm may be soft: a compliance that data determine to be so large is what it is.
+            if interval.lower <= plausible and interval.upper >= -plausible:
+                size = max(plausible, *map(abs, block.nominal))
+        times = abs(float(moved[i])) / size
+        if times <= limit or (block.nuisance and not block.prior_sd) or unconfigured(problem, block.name):
             continue
         amount, unit = Measure(block.unit, 1.0).shown(float(moved[i]))
-        placement = only_places(problem, estimate.values, int(i))
-        times, name = abs(float(moved[i])) / sizes[i], parameters.coordinate_names[i]
-        far.append(Displaced(name, amount, unit, float(times), block.prior_sd is not None, placement))
+        places = geometric and only_places(problem, estimate.values, i)
+        own = "prior" if block.prior_sd else "place" if places else "geometry" if geometric else "size"
+        far.append(Displaced(name, amount, unit, times, own))
     return tuple(sorted(far, key=lambda coordinate: -coordinate.times))
+
+
+def _typical_compliance(parameters: Parameters, estimate: Estimate, arm: str) -> float:
+    """The median of an arm's compliances that the data distinguishes from zero (rad/(N m)); zero without any."""
+    blocks = [b for b in parameters.free if b.unit == "rad_per_Nm" and b.name.startswith(f"{arm}.")]
+    own = [estimate[name] for block in blocks for name in block.entry_names]
+    return float(np.median([one.value for one in own if one.interval.lower > 0] or [0.0]))
 
 
 def proportion(problem: Problem, estimate: Estimate) -> Proportion | None:
@@ -391,37 +410,41 @@ def computed_findings(nominal_mm: Array, judged_mm: Array, figure: Figure) -> li
 def displaced(fit: Fit) -> list[Finding]:
     """Parameters that contradict their priors, or are implausibly far from their nominal values."""
     every = fit.of(figure).displaced if fit.converged else ()
-    geometry = [one for one in every if one.by_prior or not one.placement]
-    gross = [one for one in geometry if one.by_prior or one.times > FAR_BEYOND]
-    beyond = [one for one in geometry if one not in gross]
-    elsewhere = [one for one in every if one not in geometry and one.times > FAR_BEYOND]
+    gross = [one for one in every if one.by == "prior" or (one.by == "geometry" and one.times > FAR_BEYOND)]
+    beyond = [one for one in every if one.by == "geometry" and one not in gross]
+    elsewhere = [one for one in every if one.by == "place" and one.times > FAR_BEYOND]
+    large = [one for one in every if one.by == "size"]
     test = f"limit {BEYOND:g} sd of the prior; without a prior {BEYOND:g} and {FAR_BEYOND:g} typical corrections"
     action = "If the arm is so, correct the nominal values or the prior; else look for a joint's zero, sign, or unit."
-    findings = []
-    if gross:
-        findings.append(Finding("bad", f"Far from the nominal values: {_listed(gross)}.", test, action))
-    if beyond:
-        findings.append(Finding("warning", f"Far from the nominal values: {_listed(beyond)}.", test, action))
-    if elsewhere:
-        text = (
-            f"The base or the tool's point is far from where the configuration has it: {_listed(elsewhere)}. These "
-            "data do not determine whether it is there, or the instrument's frame or target is elsewhere: it has "
-            "no prior."
-        )
-        action = "If the configuration's frame is meant, look for an offset or a unit; else correct the nominal values."
-        findings.append(Finding("warning", text, test, action))
-    return findings
+    far = "Far from the nominal values: {}."
+    place = (
+        "The base or the tool's point is far from where the configuration has it: {}. These data do not determine "
+        "whether it is there, or the instrument's frame or target is elsewhere: it has no prior."
+    )
+    sized = f"limit {IMPLAUSIBLE:g} times: what a joint gives that bends by 2 mrad under half of its arm's weight at "
+    sized += "full reach, or as the arm's other joints do, where the interval reaches as low; else a typical correction"
+    rows: tuple[tuple[Grade, str, list[Displaced], str, str], ...] = (
+        ("bad", far, gross, test, action),
+        ("warning", far, beyond, test, action),
+        ("warning", place, elsewhere, test, "Look for an offset or a unit; else correct the nominal values."),
+        (
+            "warning",
+            "Larger than is plausible: {}.",
+            large,
+            sized,
+            "Give it a prior, fix it, or measure what shows it.",
+        ),
+    )
+    return [Finding(grade, text.format(_listed(own)), how, do) for grade, text, own, how, do in rows if own]
 
 
 def _listed(group: Sequence[Displaced]) -> str:
-    measures = ["its prior" if displaced.by_prior else "a typical correction" for displaced in group]
-    return first_few(
-        [
-            f"{d.name} by {digits(d.amount)} {d.unit} ({d.times:.0f} times {m})"
-            for d, m in zip(group, measures, strict=True)
-        ],
-        MOST_NAMED,
-    )
+    measures = {"prior": "its prior", "size": "what is plausible"}
+    texts = []
+    for one in group:
+        measure = f"{one.times:.0f} times {measures.get(one.by, 'a typical correction')}"
+        texts.append(f"{one.name} by {digits(one.amount)} {one.unit} ({measure})")
+    return first_few(texts, MOST_NAMED)
 
 
 def computed(fit: Fit) -> list[Finding]:

@@ -30,6 +30,7 @@ from armcal.diagnose.gross import Figure, figure
 from armcal.diagnose.held import OFF, held_scales
 from armcal.diagnose.residual_structure import CLEAR, structure
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.identifiability import OF_PRIOR, determined_in_words
 from armcal.planning.candidates import whitened_rows
 from armcal.problem.motion import LOADS, Motion
 from armcal.problem.problem import Problem
@@ -347,11 +348,11 @@ def unseen_poses(dataset: Dataset, channels: Sequence[str], between: bool = Fals
 
 
 def priors_alone(fit: Fit) -> PriorsAlone | None:
-    """How far the tip at both kinds of ``unseen_poses`` depends on combinations that the data does not determine.
+    """How far the tip at both kinds of ``unseen_poses`` depends on what priors hold.
 
-    None if there are none, or if no prior holds one of them.
+    None where they hold nothing, or where nothing holds a parameter.
     """
-    if not fit.converged or not len(fit.estimate.identifiability.null):
+    if not fit.converged or {*fit.estimate.sources.values()} in ({"data"}, set()):
         return None
     channels = [*command_channels(fit.problem.blueprint.arms)]
     at, between = (tip_by_priors(fit, unseen_poses(fit.ready.trained, channels, own)) for own in (False, True))
@@ -361,17 +362,22 @@ def priors_alone(fit: Fit) -> PriorsAlone | None:
 
 
 def tip_by_priors(fit: Fit, poses: Dataset) -> float | None:
-    """The largest standard deviation (mm) of the tip that combinations leave which only priors hold; None: none does.
+    """The largest standard deviation (mm) of the tip that is left by what priors hold; None: nothing holds a parameter.
 
-    Their covariance is what the priors give them, V (V'PV)^-1 V' over the undetermined directions V.
+    Of the directions in which data and priors are independent, those that keep as much of their prior's standard
+    deviation as a parameter that it holds: the undetermined ones, and those of which the data says hardly more.
     """
-    null, scales = fit.estimate.identifiability.null, fit.estimate.parameters.scales()
-    information = null * (scales**2 * fit.estimate.parameters.prior_information()) @ null.T
-    if np.linalg.cond(information) > 1 / np.finfo(float).eps:
+    estimate = fit.estimate
+    information, prior = estimate.square_root_information, estimate.parameters.prior_information()
+    if "nothing" in estimate.sources.values():
         return None
-    moved = _tip_motions(fit.problem, fit.estimate.values, poses, null)
-    variance = np.einsum("trnk,kl,trnl->tn", moved, np.asarray(np.linalg.inv(information)), moved)
-    return float(np.sqrt(np.max(np.maximum(variance, 0.0)))) * _MM
+    root = np.linalg.inv(information)
+    share, directions = np.linalg.eigh(root.T @ (prior[:, None] * root))  # of what is known in each direction
+    alone = (root @ directions[:, share > OF_PRIOR**2]).T / estimate.parameters.scales()
+    if not len(alone):
+        return 0.0
+    moved = _tip_motions(fit.problem, estimate.values, poses, alone)
+    return float(np.sqrt(np.max(np.einsum("trnk,trnk->tn", moved, moved)))) * _MM
 
 
 def elsewhere(fit: Fit) -> Elsewhere | None:
@@ -420,39 +426,34 @@ def _position_rows(problem: Problem) -> list[int]:
 
 
 def determined(fit: Fit) -> list[Finding]:
-    judged = fit.judged_mm[np.isfinite(fit.judged_mm)]
-    return [determined_finding(fit.estimate, fit.of(priors_alone), np.median(judged) if len(judged) else None)]
+    judged, plain = fit.judged_mm[np.isfinite(fit.judged_mm)], fit.before or fit  # a pose residual determines nothing
+    return [determined_finding(plain.estimate, plain.of(priors_alone), np.median(judged) if len(judged) else None)]
 
 
 def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
-    known = estimate.identifiability
+    sources, combinations = estimate.sources, estimate.identifiability.undetermined
     test = "rank of the Jacobian in typical scales"
-    if not len(known):
+    if not sources:
         text = "No parameter was free: the nominal model was judged, nothing was calibrated."
         return Finding("warning", text, test, "Free parameters: parameters.free.")
-    count = len(known.undetermined)
-    if not count:
-        return Finding("good", f"The data determines all {known.rank} free parameters.", test)
-    listed = "; ".join(str(combination) for combination in known.undetermined[:MOST_TOLD])
-    more = f"; and {count - MOST_TOLD} more" if count > MOST_TOLD else ""
+    text = determined_in_words(sources)
+    if {*sources.values()} == {"data"}:
+        return Finding("good", f"{text}.", test)
+    test += f", and standard deviations of {100 * OF_PRIOR:g} % of the priors'"
+    if combinations and (alone is None or len(combinations) <= FEW_NAMED):
+        text += f" ({'; '.join(map(str, combinations[:MOST_TOLD]))})"
     if alone is None:
-        text = f"Not determined by the data, only by priors: {listed}{more}."
-        return Finding("bad", text, test, "Free fewer parameters, or measure what armcal identify asks for.")
-    held = f"{count} {'combination is' if count == 1 else 'combinations are'} determined by priors alone"
-    held += f" ({listed})" if count <= FEW_NAMED else ""
+        return Finding("bad", f"{text}.", test, "Free fewer parameters, or measure what armcal identify asks for.")
     test = f"{test}; the tip at {alone.poses} poses of recorded joint positions, and at as many between them"
     test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
     negligible = np.inf if typical_mm is None else NEGLIGIBLE_SHARE * typical_mm
     if alone.between_mm <= negligible:
         most = f"{alone.between_mm:.2g}" if alone.between_mm >= 0.001 else "0.001"
-        text = f"{held}; the tip at unseen poses does not depend on them (at most {most} mm, 1 sd)."
+        text += f". The tip at unseen poses does not depend on them (at most {most} mm, 1 sd)."
         return Finding("note", text, test, "Nothing for the tip; armcal identify names them.")
+    text += f". The tip at unseen poses depends on them, by up to {alone.between_mm:.2g} mm (1 sd)"
+    action = "armcal identify names them, and armcal plan finds the poses that determine them."
     if alone.worst_mm <= negligible:
-        text = f"{held}. The tip depends on them by up to {alone.between_mm:.2g} mm (1 sd) where a joint stands "
-        text += "between its recorded positions, or is approached from another side there; elsewhere it does not."
-        advice = "Measure each joint between its recorded positions too, from both sides; armcal identify names them."
-        return Finding("warning", text, test, advice)
-    text = f"{held}, and the tip at unseen poses depends on them, by up to {alone.between_mm:.2g} mm (1 sd)."
-    return Finding(
-        "warning", text, test, "armcal identify names them, and armcal plan finds the poses that determine them."
-    )
+        text += ", where a joint stands between its recorded positions, or is approached from another side there"
+        action = "Measure each joint between its recorded positions too, from both sides; armcal identify names them."
+    return Finding("warning", f"{text}.", test, action)

@@ -23,11 +23,11 @@ from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.unseen import Elsewhere, elsewhere, hidden_payload, priors_alone, rounding
 from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
+from armcal.estimate.identifiability import deviations as deviations_of
 from armcal.estimate.prediction import NewRecording
 from armcal.estimate.start import certificates
 from armcal.estimate.validation import Halves, pose_size, summarise
 from armcal.measure.measurement import Placed
-from armcal.planning.candidates import deviations as deviations_of
 from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterator, KeysView
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.special import stdtrit
@@ -14,7 +14,13 @@ from scipy.special import stdtrit
 from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.errors import NotConvergedError
-from armcal.estimate.identifiability import Identifiability, InverseInformation, identify_from
+from armcal.estimate.identifiability import (
+    DeterminedBy,
+    Identifiability,
+    InverseInformation,
+    determined_by,
+    identify_from,
+)
 from armcal.io.parallel import Executor
 from armcal.problem.problem import Problem, triangular
 from armcal.problem.variants import factor_at_zero
@@ -22,7 +28,6 @@ from armcal.problem.variants import factor_at_zero
 CONFIDENCE = 0.95
 NEAR_A_BOUND_SD = 3.0  # Within so many standard deviations of a bound an interval is one-sided
 SMALLEST_SPREAD = 1e-12
-OF_PRIOR = 0.95  # Of its prior's standard deviation: data that leave more of it say nothing of a parameter
 AT_BOUND = 1e-6  # In typical scales of the parameter: closer than this, a parameter lies on its bound
 
 CHECK_THE_DATA = (
@@ -96,11 +101,11 @@ def spread(estimator: Estimator, executor: Executor | None) -> Estimator:
 
 @dataclass(frozen=True)
 class Interval95:
-    """A 95 % interval of one canonical entry; ``bound`` is the end that is a bound of the entry itself, if one is."""
+    """A 95 % interval of one canonical entry."""
 
     lower: float
     upper: float
-    bound: Literal["lower", "upper"] | None = None
+    bounds: tuple[str, ...] = ()  # the ends that are bounds of the entry itself: lower, upper
 
 
 @dataclass(frozen=True)
@@ -128,8 +133,6 @@ class Estimate:
         noise_scale: residuals in units of the declared noise (standard deviation).
         degrees_of_freedom: residual numbers less what the fit takes up of them, see ``degrees_of_freedom``.
         identifiability: what the data alone determines.
-        determined: per free entry, whether data and priors together determine it.
-        identified_by_data: per free entry, whether the data do; else only a prior holds it, if anything does.
         verdict: the solver's.
         widened: by what the standard deviations of free entries grew because neighbouring records err alike; empty
             where they do and nothing grew by it, None where no such correlation was found.
@@ -144,8 +147,6 @@ class Estimate:
     noise_scale: float
     degrees_of_freedom: float
     identifiability: Identifiability
-    determined: tuple[bool, ...]
-    identified_by_data: tuple[bool, ...]
     verdict: SolverVerdict
     widened: tuple[float, ...] | None = None
 
@@ -191,7 +192,26 @@ class Estimate:
     def deviations(self) -> Array:
         """Standard deviations of the free canonical entries; not a number where undetermined."""
         deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        return np.where(np.array(self.determined, dtype=bool), deviation, np.nan)
+        return np.where([by == "nothing" for by in self.determined_by], np.nan, deviation)
+
+    @cached_property
+    def sources(self) -> dict[str, DeterminedBy]:
+        """What determines each free parameter, by the names of their coordinates."""
+        parameters, root = self.parameters, np.linalg.pinv(self._chain)
+        deviations = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", root, self.covariance, root), 0.0))
+        by = determined_by(self.identifiability, parameters, deviations)
+        return dict(zip(parameters.coordinate_names, by, strict=True))
+
+    @cached_property
+    def determined_by(self) -> tuple[DeterminedBy, ...]:
+        """What determines each free canonical entry: the least of what determines the coordinates that move it."""
+        moved, by = np.abs(self._chain) * self.parameters.scales(), np.array(list(self.sources.values()), dtype=object)
+        moves = moved > 1e-6 * np.linalg.norm(moved, axis=1, keepdims=True)
+        return tuple(next((one for one in ("nothing", "prior") if one in by[row]), "data") for row in moves)
+
+    @cached_property
+    def _chain(self) -> Array:
+        return self.parameters.entries_jacobian(self.values)
 
     @cached_property
     def at_bound(self) -> tuple[str, ...]:
@@ -211,22 +231,23 @@ class Estimate:
         one-sided quantile there would be shorter, but choosing between the two kinds by the estimate itself
         would then cover the truth in less than 95 % of cases [Feldman1998].
         """
-        quantile, intervals = float(stdtrit(max(self.degrees_of_freedom, 1.0), 0.5 + CONFIDENCE / 2)), []
+        quantile = float(stdtrit(max(self.degrees_of_freedom, 1.0), 0.5 + CONFIDENCE / 2))
         rows = zip(self.free_values, self.unconstrained, self.deviations, *_entry_bounds(self.parameters), strict=True)
-        for value, unconstrained, sd, lower, upper in rows:
-            # Beyond a bound the interval starts there: an estimate that noise pushed far out is no surer than one at
-            # the bound.
-            low, high = min(unconstrained, upper) - quantile * sd, max(unconstrained, lower) + quantile * sd
-            if not np.isfinite(sd):
-                interval = Interval95(lower, upper)
-            elif unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
-                interval = Interval95(lower, float(np.clip(high, lower, upper)), "lower")
-            elif upper - unconstrained < NEAR_A_BOUND_SD * sd:
-                interval = Interval95(float(np.clip(low, lower, upper)), upper, "upper")
-            else:
-                interval = Interval95(float(value - quantile * sd), float(value + quantile * sd))
-            intervals.append(interval)
-        return tuple(intervals)
+        return tuple(interval(value, at, sd, low, high, quantile) for value, at, sd, low, high in rows)
+
+
+def interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:
+    """Of an entry between these bounds, by its value and where it would be without them; see ``Estimate.intervals``."""
+    low, high = value - quantile * sd, value + quantile * sd
+    if not np.isfinite(sd):
+        low, high = lower, upper
+    # Beyond a bound the interval starts there: an estimate that noise pushed far out is no surer than one at the bound.
+    elif unconstrained - lower < NEAR_A_BOUND_SD * sd and unconstrained - lower <= upper - unconstrained:
+        low, high = lower, np.clip(max(unconstrained, lower) + quantile * sd, lower, upper)
+    elif upper - unconstrained < NEAR_A_BOUND_SD * sd:
+        low, high = np.clip(min(unconstrained, upper) - quantile * sd, lower, upper), upper
+    ends = {"lower": low == lower > -np.inf, "upper": high == upper < np.inf}
+    return Interval95(float(low), float(high), tuple(end for end, is_bound in ends.items() if is_bound))
 
 
 @dataclass(frozen=True)
@@ -272,7 +293,6 @@ def estimate(problem: Problem, solution: Solution, influence: Influence | None =
     by_both = np.hstack([by_data, half @ (half.T * np.sqrt(prior))])
     pull = equations.gradient + prior * parameters.coordinates(parameters.local(solution.values))
     step = -(half @ (half.T @ pull))
-    unseen = np.linalg.norm(inverse.null, axis=0)
     information = triangle * (influence.slope / max(influence.spread, SMALLEST_SPREAD))
     return Estimate(
         parameters=parameters,
@@ -284,28 +304,8 @@ def estimate(problem: Problem, solution: Solution, influence: Influence | None =
         noise_scale=influence.noise_scale,
         degrees_of_freedom=freedom,
         identifiability=known,
-        determined=tuple(bool(x) for x in ~(np.abs(chain) @ unseen > 1e-6)),
-        identified_by_data=_identified_by_data(chain, prior, half, parameters.scales(), known),
         verdict=solution.verdict,
     )
-
-
-def _identified_by_data(
-    chain: Array, prior: Array, half: Array, scales: Array, known: Identifiability
-) -> tuple[bool, ...]:
-    """Of each entry, whether data add to its prior, as data as noisy as declared would.
-
-    So no entry that takes part in an undetermined combination (by more than 1e-6 of its typical scale), nor one whose
-    standard deviation is still its prior's.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        of_prior = np.sum(np.where(chain != 0, chain**2 / prior, 0.0), axis=1)
-    added = np.sum((chain @ half) ** 2, axis=1) <= OF_PRIOR**2 * of_prior
-    if not len(known.null):
-        return tuple(bool(x) for x in added)
-    moves = np.linalg.norm(chain @ (known.null * scales).T, axis=1)
-    typical = np.linalg.norm(chain * scales, axis=1)
-    return tuple(bool(x) for x in added & (moves <= 1e-6 * np.where(typical > 0, typical, 1.0)))
 
 
 def degrees_of_freedom(problem: Problem, values: Array, slope: float = 1.0) -> float:

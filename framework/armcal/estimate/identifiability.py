@@ -221,7 +221,7 @@ POOR_CONDITION = 1e6
 HARDLY = 1.0
 """A singular value below this: the declared noise leaves the combination more than its typical scale uncertain."""
 CORRELATED = 0.95
-_NEGLIGIBLE = 1e-6
+_NEGLIGIBLE = 1e-6  # Of its typical scale: a parameter that moves by less takes no part in a combination
 _NAMED = 1e-4
 _LARGE_SHARE = 0.2
 
@@ -237,11 +237,6 @@ class Identifiability:
     undetermined: tuple[Combination, ...]  # combinations the data does not see
     rank_by_qr: int = 0  # how many are determined by the diagonal of a QR decomposition with pivoting
     measures: tuple[Measure, ...] = ()  # how each coordinate is shown; empty for coefficients in typical scales
-
-    @cached_property
-    def determined(self) -> tuple[bool, ...]:
-        null = self.null
-        return tuple(bool(x < _NEGLIGIBLE) for x in np.linalg.norm(null, axis=0)) if len(null) else (True,) * len(self)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -279,6 +274,47 @@ class Identifiability:
                 combination = named(self.directions[i], self.names, self.measures, _LARGE_SHARE)
                 combinations.append((combination, 1 / value if value > 0 else float("inf")))
         return tuple(combinations)
+
+
+DeterminedBy = Literal["data", "prior", "nothing"]
+DETERMINED_BY: dict[DeterminedBy, str] = {
+    "data": "determined by the data",
+    "prior": "held by its prior",
+    "nothing": "undetermined",
+}
+OF_PRIOR = 0.9  # Of its prior's standard deviation: a parameter that keeps more of it is held by its prior
+
+
+def determined_by(known: Identifiability, parameters: Parameters, deviations: Array) -> tuple[DeterminedBy, ...]:
+    """What determines each free coordinate, of these standard deviations (n, SI) by data and priors together.
+
+    The data, unless it takes part in a combination that they do not determine (by more than 1e-6 of its typical
+    scale), or keeps 90 % of its prior's standard deviation.
+    """
+    information = parameters.prior_information()
+    by_priors = np.linalg.norm(known.null, axis=0) >= _NEGLIGIBLE
+    by_nothing = np.linalg.norm(unheld(parameters, known), axis=0) >= _NEGLIGIBLE
+    by_priors |= deviations * np.sqrt(information) > OF_PRIOR
+    return tuple("nothing" if n else "prior" if p else "data" for n, p in zip(by_nothing, by_priors, strict=True))
+
+
+def expected_sources(known: Identifiability, parameters: Parameters, triangle: Array) -> dict[str, DeterminedBy]:
+    """What will determine each free parameter, by name, if the noise is as declared; see ``analyse`` for R."""
+    deviations = np.sqrt(np.diag(expected_covariance(triangle, parameters)))
+    return dict(zip(known.names, determined_by(known, parameters, deviations), strict=True))
+
+
+def determined_in_words(sources: Mapping[str, DeterminedBy]) -> str:
+    """How many free parameters the data determine, and which others priors hold, or nothing."""
+    names = {by: [name for name, own in sources.items() if own == by] for by in DETERMINED_BY}
+    if len(names["data"]) == len(sources):
+        return f"The data determines all {len(sources)} free parameters"
+    text = f"The data determines {len(names['data'])} of {len(sources)} free parameters"
+    for words, own in (("held by priors", names["prior"]), ("undetermined", names["nothing"])):
+        if own:
+            more = f" and {len(own) - MOST_NAMES} more" if len(own) > MOST_NAMES else ""
+            text += f"; {words}: {', '.join(own[:MOST_NAMES])}{more}"
+    return text
 
 
 def measures_of(parameters: Parameters) -> tuple[Measure, ...]:
@@ -335,6 +371,15 @@ def expected_covariance(triangle: Array, parameters: Parameters) -> Array:
     inverse = InverseInformation.of(triangle, parameters)
     known = np.linalg.norm(inverse.null, axis=0) < _NEGLIGIBLE
     return np.asarray(inverse.root @ inverse.root.T * np.outer(known, known))
+
+
+def deviations(triangle: Array) -> Array:
+    """Standard deviations (n) from R (rows x n) with R'R the information; infinite where something is undetermined."""
+    size = triangle.shape[1]
+    _, values, directions = np.linalg.svd(np.vstack([triangle, np.zeros((size, size))]), full_matrices=False)
+    seen = values > RANK_TOLERANCE * values.max(initial=1e-300)
+    spread = np.linalg.norm(directions[seen].T / values[seen], axis=1)
+    return np.where(np.linalg.norm(directions[~seen], axis=0) > _NEGLIGIBLE, np.inf, spread)
 
 
 def correlated_pairs(
@@ -514,14 +559,7 @@ def _deviations(columns: Array, places: Mapping[str, slice], kept: Sequence[str]
     """Standard deviations in typical scales (n) if these blocks are free; infinite where undetermined, or not kept."""
     inside = np.concatenate([np.arange(columns.shape[1])[places[name]] for name in kept]) if kept else np.zeros(0, int)
     deviation = np.full(columns.shape[1], np.inf)
-    if not len(inside):
-        return deviation
-    _, values, directions = np.linalg.svd(columns[:, inside], full_matrices=True)
-    values = np.concatenate([values, np.zeros(len(inside) - len(values))])
-    seen = values > RANK_TOLERANCE * values[0]
-    known = np.sqrt(np.sum((directions[seen] / values[seen][:, None]) ** 2, axis=0))
-    blurred = np.linalg.norm(directions[~seen], axis=0) > 1e-6
-    deviation[inside] = np.where(blurred, np.inf, known)
+    deviation[inside] = deviations(columns[:, inside])
     return deviation
 
 
@@ -542,16 +580,14 @@ GIVE_A_LENGTH = "give one length: a known distance, a tracker's record, or a dim
 _GROWTH_LEFT = 1e-4  # Of the size of the workspace: what may be left of a growth of all tool positions in proportion
 _POSES = 60
 MOST_LISTED = 5  # So many undetermined combinations are listed in one message
-FEW_HELD = 2  # Combinations under priors that are listed in full: they do no harm, and more of them bury the rest
 
 
 @dataclass(frozen=True)
 class Undetermined:
-    """A combination that the records do not determine, why, and the priors that take part in it."""
+    """A combination that the records do not determine, and why."""
 
     combination: Combination
     cause: Cause
-    priors: tuple[str, ...]
 
     def __str__(self) -> str:
         return f"{self.combination}: {CAUSES[self.cause]}"
@@ -570,8 +606,6 @@ def explain(problem: Problem, values: Array, known: Identifiability) -> tuple[Un
     null = known.null
     if not len(null):
         return ()
-    held = problem.parameters.prior_information() > 0
-    priors = {name for name, has in zip(known.names, held, strict=True) if has}
     causes: list[Cause] = ["unknown"] * len(null)
     nested: tuple[Array, ...] = ()
     with suppress(NotConvergedError):
@@ -590,20 +624,16 @@ def explain(problem: Problem, values: Array, known: Identifiability) -> tuple[Un
             causes += ["poses"] * (len(null) - len(here))
     vectors = sparse_basis(null, nested, _WITHIN)
     combinations = [named(vector, known.names, known.measures, _NAMED) for vector in vectors]
-    return tuple(
-        Undetermined(combination, cause, tuple(name for name in combination.names if name in priors))
-        for combination, cause in zip(combinations, causes, strict=True)
-    )
+    return tuple(Undetermined(*pair) for pair in zip(combinations, causes, strict=True))
 
 
-def held_by_nothing(parameters: Parameters, known: Identifiability) -> tuple[Combination, ...]:
-    """Undetermined combinations that priors do not hold either."""
+def unheld(parameters: Parameters, known: Identifiability) -> Array:
+    """Orthonormal rows, in typical scales, of what neither data nor priors determine."""
     null = known.null
     if not len(null):
-        return ()
+        return null
     strength = np.sqrt(parameters.prior_information()) * parameters.scales()
-    free = null_rows((null * strength).T, RANK_TOLERANCE * max(float(strength.max()), 1e-300)) @ null
-    return tuple(named(vector, known.names, known.measures, _NAMED) for vector in sparse_basis(free))
+    return null_rows((null * strength).T, RANK_TOLERANCE * max(float(strength.max()), 1e-300)) @ null
 
 
 def nearby(parameters: Parameters, values: Array, away: float = _AWAY, seed: int = 0) -> Array:
@@ -665,7 +695,7 @@ def require_solvable(problem: Problem, start: Array) -> tuple[str, ...]:
     """Refuse a problem whose answer would be invented.
 
     Returns:
-        warnings: what priors alone hold, and a poor condition.
+        warnings: what is left to priors because the records are too few, or see no scale.
 
     Raises:
         ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
@@ -682,24 +712,17 @@ def require_solvable(problem: Problem, start: Array) -> tuple[str, ...]:
             raise ProblemError(f"{text}.", hint="Measure more poses, fix parameters, or give every one a prior.")
         warnings.append(f"{text}: what the data does not determine comes from the priors.")
     known = identify(problem, start)
-    if known.undetermined:
+    unseen_scale = scale_is_unseen(problem, start, known)
+    if len(unheld(parameters, known)):
         explained = explain(problem, start, known)
         listed = "; ".join(str(undetermined) for undetermined in explained[:MOST_LISTED])
         more = len(explained) - MOST_LISTED
         listed += f"; and {more} more, which armcal identify lists" if more > 0 else ""
-        text = f"the data does not determine {len(explained)} combinations"
-        unseen_scale = scale_is_unseen(problem, start, known)
-        if held_by_nothing(parameters, known):
-            first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
-            raise ProblemError(f"{first}{text}: {listed}.", hint=_sentence(f"{mend}{_mend(explained)}"))
-        if unseen_scale:
-            warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
-        listed = listed if len(explained) <= FEW_HELD else "armcal identify lists them"
-        warnings.append(
-            f"at the nominal values {text}; their priors hold them: {listed}. The verdict counts at the answer."
-        )
-    if known.condition > POOR_CONDITION and not has_prior.all():
-        warnings.append(f"the scaled condition is {known.condition:.1e}: {known.weakest} is hardly determined.")
+        first, mend = (f"{UNSEEN_SCALE}; ", f"{GIVE_A_LENGTH}. ") if unseen_scale else ("", "")
+        text = f"{first}the data does not determine {len(explained)} combinations: {listed}."
+        raise ProblemError(text, hint=_sentence(f"{mend}{_mend(explained)}"))
+    if unseen_scale:
+        warnings.append(f"{UNSEEN_SCALE}; its priors hold it. To know it, {GIVE_A_LENGTH}.")
     return tuple(warnings)
 
 
@@ -734,14 +757,6 @@ class Candidate:
     p_value: float  # that it gains nothing, counting that so many were looked at
 
 
-@dataclass(frozen=True)
-class Freeing:
-    """What is worth freeing, in that order, and what else the records would determine beside it."""
-
-    gaining: tuple[Candidate, ...]
-    others: tuple[Candidate, ...]
-
-
 def candidates(parameters: Parameters) -> tuple[str, ...]:
     return tuple(
         block.name
@@ -752,8 +767,11 @@ def candidates(parameters: Parameters) -> tuple[str, ...]:
     )
 
 
-def freeing(wide: Problem, own: Sequence[str], values: Array) -> Freeing:
-    """Judge all that is free in ``wide`` and not among the ``own`` parameters, at a fit of these alone."""
+def freeing(wide: Problem, own: Sequence[str], values: Array) -> tuple[tuple[Candidate, ...], tuple[Candidate, ...]]:
+    """What is worth freeing, in that order, and what else the records would determine beside it.
+
+    Of all that is free in ``wide`` and not among the ``own`` parameters, at a fit of these alone.
+    """
     parameters = wide.parameters
     chain = parameters.entries_jacobian(values) * parameters.scales()
     model = wide.normal_equations(values).chained(chain)
@@ -773,7 +791,7 @@ def freeing(wide: Problem, own: Sequence[str], values: Array) -> Freeing:
         taken.extend(places[best.name])
         left.remove(best.name)
     others = [search.judged(name, places[name], taken, count) for name in left]
-    return Freeing(tuple(gaining), tuple(one for one in others if one is not None))
+    return tuple(gaining), tuple(one for one in others if one is not None)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from pydantic import Field
 from scipy.special import fdtri
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.config_text import finite
 from armcal.base.domains import Interval
 from armcal.base.settings import Settings
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
@@ -232,31 +233,21 @@ class Profile:
 
     name: str  # of the parameter
     value: float  # found (SI)
-    deviation: float  # its standard deviation by the curvature at the estimate
+    sd: float  # its standard deviation by the curvature at the estimate
     lower: float
     upper: float
     lower_end: End
     upper_end: End
     curve: Array  # places and twice the adjusted rise of the cost (2 x K), in order
     quantile: float  # what the rise must not pass
-    better: bool  # whether a fit was found that is better than the estimate: it was not the best one
-    failed: int  # fits that did not converge; the search ends at them
+    better_fit_found: bool  # than the estimate: it was not the best one
+    failed_fits: int  # that did not converge; the search ends at them
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "value": self.value,
-            "sd": self.deviation if np.isfinite(self.deviation) else None,
-            "level": CONFIDENCE,
-            "lower": self.lower,
-            "upper": self.upper,
-            "lower_end": self.lower_end,
-            "upper_end": self.upper_end,
-            "quantile": self.quantile,
-            "better_fit_found": self.better,
-            "failed_fits": self.failed,
-            "curve": {"value": self.curve[0].tolist(), "rise": self.curve[1].tolist()},
-        }
+        numbers = {key: value for key, value in vars(self).items() if key not in ("name", "curve")}
+        curve = {"value": self.curve[0].tolist(), "rise": self.curve[1].tolist()}
+        return {**dict(finite(numbers)), "level": CONFIDENCE, "curve": curve}
 
 
 def profiles(
@@ -304,19 +295,9 @@ def _profile(problem: Problem, estimator: Estimator, estimate: Estimate, name: s
     upper, upper_end = search.end(1.0)
     places = np.array(sorted(search.rises))
     rises = np.array([search.rises[place] for place in places])
-    return Profile(
-        name,
-        search.value,
-        search.deviation,
-        lower,
-        upper,
-        lower_end,
-        upper_end,
-        np.vstack([places, rises]),
-        search.quantile,
-        bool(rises.min() < -_BETTER * search.quantile),
-        search.failed,
-    )
+    better = bool(rises.min() < -_BETTER * search.quantile)
+    ends, curve = (lower, upper, lower_end, upper_end), np.vstack([places, rises])
+    return Profile(name, search.value, search.deviation, *ends, curve, search.quantile, better, search.failed)
 
 
 class _Search:

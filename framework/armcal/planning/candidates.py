@@ -23,8 +23,6 @@ below what any real measurement gives, far above rounding."""
 _FLOOR = 1e-300  # Eigenvalues are kept above it, so that a singular matrix is very bad and not an error
 _ROWS_AT_ONCE = 8192
 _FEW_ROWS = 8
-_SEEN = 1e-9
-_TAKES_PART = 1e-6
 
 
 @dataclass(frozen=True)
@@ -81,16 +79,6 @@ class Candidates:
                 few = part[start : start + _ROWS_AT_ONCE]
                 total[start : start + _ROWS_AT_ONCE] += np.einsum("ij,ij->i", few @ gradient, few)
         return total
-
-
-def deviations(triangle: Array) -> Array:
-    """Standard deviations (n) from R (rows x n) with R'R the information; infinite where something is undetermined."""
-    size = triangle.shape[1]
-    _, values, directions = np.linalg.svd(np.vstack([triangle, np.zeros((size, size))]), full_matrices=False)
-    seen = values > _SEEN * max(float(values[0]), 1e-300)
-    spread = np.linalg.norm(directions[seen].T / values[seen], axis=1)
-    undetermined = np.linalg.norm(directions[~seen], axis=0) > _TAKES_PART
-    return np.where(undetermined, np.inf, spread)
 
 
 def log_determinant(eigenvalues: Array) -> Array:

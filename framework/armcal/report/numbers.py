@@ -3,13 +3,10 @@
 import math
 from collections.abc import Iterable
 
-from armcal.base.domains import Pose, Rotation, ScrewAxis
-from armcal.base.parameters import ParameterBlock
-
 NONE = "\u2013"
 MINUS = "\u2212"
 _MOST_DECIMALS = 9
-_ASCII = {MINUS: "-", NONE: "-", "≤": "up to", "≥": "from", "\u202f": " ", "\u2007": " ", "\u2008": " "}
+_ASCII = {MINUS: "-", NONE: "-", "\u202f": " ", "\u2007": " ", "\u2008": " "}
 
 
 def fixed(value: float | None, decimals: int, signed: bool = False) -> str:
@@ -64,14 +61,3 @@ def in_ascii(text: str) -> str:
     for sign, word in _ASCII.items():
         text = text.replace(sign, word)
     return text.strip()
-
-
-def entry_unit(block: ParameterBlock, suffix: str) -> str:
-    """The SI unit of one canonical entry; directions and quaternions have none."""
-    if isinstance(block.domain, Rotation):
-        return "1"
-    if isinstance(block.domain, Pose):
-        return "m" if suffix in ("x", "y", "z") else "1"
-    if isinstance(block.domain, ScrewAxis):
-        return "m" if suffix.startswith("v") else "1"
-    return block.unit

@@ -9,7 +9,13 @@ import numpy as np
 from armcal.base.units import readable
 from armcal.diagnose.checks import Finding
 from armcal.estimate.estimator import Estimate
-from armcal.estimate.identifiability import CORRELATED, bound_together, correlated_pairs, correlations
+from armcal.estimate.identifiability import (
+    CORRELATED,
+    bound_together,
+    correlated_pairs,
+    correlations,
+    determined_in_words,
+)
 from armcal.plugins import PluginRegistry, said
 from armcal.report import run_figures as figures
 from armcal.report import run_tables as tables
@@ -107,7 +113,7 @@ def _accuracy(result: RunResult) -> list[Section]:
         held += "; each training record also judged by cross-validation"
     elif not len(split.holdout):
         held += ", so that these numbers flatter the model"
-    free = plural(len(result.estimate.names), "free parameter")
+    free = plural(len(result.estimate.sources), "free parameter")
     words = f"{free} found from {plural(len(split.train), 'training record')}; {held}."
     shown: list[Part] = []
     if any(own.count for own in result.table.calibrated.values()):
@@ -124,7 +130,7 @@ def _accuracy(result: RunResult) -> list[Section]:
 
 
 def _parameters(result: RunResult) -> list[Section]:
-    estimate, count_free = result.estimate, len(result.estimate.names)
+    estimate, count_free = result.estimate, len(result.estimate.sources)
     if not count_free:
         text = "No parameter was free: the model stands as it was given."
         return [Section("Parameters", parts=[text], name="parameters")]
@@ -160,13 +166,15 @@ def _records(result: RunResult) -> list[Section]:
 def _determined(estimate: Estimate) -> list[Section]:
     """What the data hardly determine, or not: combinations of parameters, and pairs that are correlated."""
     known, names = estimate.identifiability, estimate.names
-    parts: list[Part] = [f"Rests on priors alone: {combination}." for combination in known.undetermined]
+    parts: list[Part] = [f"{determined_in_words(estimate.sources)}."]
+    parts += [f"The data does not determine a combination: {combination}." for combination in known.undetermined]
     if known.rank:
         parts.append(f"Least determined: {known.weakest}. Scaled condition {significant(known.condition)}.")
     if len(names) > 1:
         with np.errstate(invalid="ignore"):
             matrix = correlations(estimate.covariance)
-        matrix = np.where(np.outer(estimate.determined, estimate.determined), matrix, 0.0)
+        known_sd = np.isfinite(estimate.deviations)
+        matrix = np.where(np.outer(known_sd, known_sd), matrix, 0.0)
         pairs = correlated_pairs(matrix, names, CORRELATED, bound_together(estimate.parameters))
         # The strongest pairs whatever their size, zeros left out.
         rows, columns = np.triu_indices(len(names), 1)

@@ -9,7 +9,7 @@ from armcal.base.units import shown_unit
 from armcal.diagnose import outliers
 from armcal.estimate.estimator import Estimate
 from armcal.report.document import Figure, Marks, Panel
-from armcal.report.numbers import count, entry_unit, plural, significant
+from armcal.report.numbers import count, plural, significant
 from armcal.run.result import RunResult
 
 MOST_POINTS = 3000  # of a panel; more are thinned out
@@ -159,9 +159,9 @@ def _steps(errors: Array, low: float) -> tuple[Array, Array]:
 def corrections(estimate: Estimate) -> Figure | None:
     """What was added to each parameter, with its 95 % interval: a panel a unit."""
     nominal, rows = estimate.parameters.nominal(), dict[str, list[tuple[str, float, float, float]]]()
-    entries = [(b, suffix) for b in estimate.parameters.free for suffix in b.domain.entries]
-    for i, (entry, (block, suffix)) in enumerate(zip(estimate.free_entries, entries, strict=True)):
-        factor, unit = shown_unit(entry_unit(block, suffix))
+    entries = [(block, unit) for block in estimate.parameters.free for unit in block.entry_units]
+    for i, (entry, (block, si)) in enumerate(zip(estimate.free_entries, entries, strict=True)):
+        factor, unit = shown_unit(si)
         if block.nuisance or not unit:
             continue
         interval, before = estimate.intervals[i], nominal[entry]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,11 @@ from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import shown_unit
 from armcal.diagnose.outliers import large_errors
 from armcal.estimate.estimator import Estimate
+from armcal.estimate.identifiability import DETERMINED_BY
 from armcal.estimate.uncertainty import Bootstrap, Profile
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.document import Table
-from armcal.report.numbers import NONE, common_decimals, count, decimals_for, entry_unit, fixed, significant
+from armcal.report.numbers import NONE, common_decimals, count, decimals_for, fixed, significant
 from armcal.run.result import ErrorTable, GroupError, RunResult
 
 SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
@@ -67,52 +69,46 @@ def groups_table(groups: Sequence[GroupError], unit: str) -> Table:
 def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None, profiles: Sequence[Profile] = ()) -> Table:
     """A row a free canonical entry in customary units, with its intervals by curvature, by refits and by profile."""
     nominal, profiled, rows = estimate.parameters.nominal(), {profile.name: profile for profile in profiles}, []
-    units = [entry_unit(b, suffix) for b in estimate.parameters.free for suffix in b.domain.entries]
-    for i, (name, entry, interval) in enumerate(
-        zip(estimate.names, estimate.free_entries, estimate.intervals, strict=True)
-    ):
+    units = [unit for block in estimate.parameters.free for unit in block.entry_units]
+    for i, (name, own) in enumerate(estimate.items()):
         factor, unit = shown_unit(units[i])
-        own = (estimate.values[entry], nominal[entry], estimate.deviations[i])
-        value, before, sd = (factor * float(number) for number in own)
+        numbers = (own.value, nominal[estimate.free_entries[i]], own.deviation)
+        value, before, sd = (factor * float(number) for number in numbers)
         # Two digits of the standard deviation; five of the value where there is none, three decimals of a zero.
         size = sd if math.isfinite(sd) and sd > 0 else max(abs(value), abs(before)) / 1000
         digits = decimals_for(size) if size else 3
-        lower, upper = (fixed(factor * float(end), digits) for end in (interval.lower, interval.upper))
-        words = f"{lower} to {upper}" if math.isfinite(sd) else NONE
-        if math.isfinite(sd) and interval.bound:
-            words = f"≤ {upper}" if interval.bound == "lower" else f"≥ {lower}"
+        span = partial(_span, factor, digits)
+        words = span(own.interval.lower, own.interval.upper) if math.isfinite(sd) else NONE
         remarks = ["at its bound"] if name in estimate.at_bound else []
-        if not estimate.identified_by_data[i]:
-            remarks.append("held by its prior" if math.isfinite(sd) else "not determined")
-        row = [
-            name,
-            fixed(before, digits),
-            fixed(value, digits),
-            fixed(value - before, digits, True),
-            fixed(sd, digits),
-        ]
-        row.append(words)
+        remarks += [] if remarks else [f"{end} end at its bound" for end in own.interval.bounds]
+        by = estimate.determined_by[i]
+        remarks += [] if by == "data" else [DETERMINED_BY[by]]
+        row = [name, *(fixed(x, digits) for x in (before, value)), fixed(value - before, digits, True)]
+        row += [fixed(sd, digits), words]
         if bootstrap is not None:
-            low, high = (fixed(factor * float(end), digits) for end in bootstrap.intervals[i])
-            row += [fixed(factor * float(bootstrap.deviations[i]), digits), f"{low} to {high}"]
+            row += [fixed(factor * float(bootstrap.deviations[i]), digits), span(*bootstrap.intervals[i])]
         if profiled:
             profile = profiled.get(name)
-            ends = [fixed(factor * end, digits) for end in (profile.lower, profile.upper)] if profile else []
-            row.append(" to ".join(ends))
+            row.append(span(profile.lower, profile.upper) if profile else "")
             sides = [("lower", profile.lower_end), ("upper", profile.upper_end)] if profile else []
             remarks += [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
-            remarks += ["a better fit was found on the way: try more starts"] if profile and profile.better else []
-        rows.append((*row, unit, ", ".join(remarks)))
+            better = profile is not None and profile.better_fit_found
+            remarks += ["a better fit was found on the way: try more starts"] if better else []
+        rows.append((*row, unit, ", ".join(dict.fromkeys(remarks))))
     headings = ["Parameter", "Nominal", "Calibrated", "Correction", "sd", "95 % interval"]
     headings += ["Bootstrap sd", "By bootstrap"] if bootstrap else []
     headings += ["By profile"] if profiled else []
-    caption = "Free parameters, with standard deviation (sd) and 95 % intervals; one-sided next to a bound"
+    caption = "Free parameters, with standard deviation (sd) and 95 % intervals"
     if bootstrap is not None:
         how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
         failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
         caption += f". Bootstrap: {len(bootstrap.values)} refits{failed}; {how}"
     caption += ". By profile: everything else was fitted again, within bounds, for each value" if profiled else ""
     return Table(caption, (*headings, "Unit", "Remark"), rows, ("Unit", "Remark"), ("Nominal", "Correction", "sd"))
+
+
+def _span(factor: float, digits: int, lower: float, upper: float) -> str:
+    return " to ".join(fixed(factor * float(end), digits) for end in (lower, upper))
 
 
 def principal_table(estimate: Estimate) -> Table | None:

@@ -58,13 +58,13 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
     start = next(iter(ready.start.values(ready.problem)), parameters.nominal())
     fitted = fit(wide.with_parameters(parameters), experiment.estimator, start, progress)
     values = fitted.solution.values
-    chosen = freeing(wide.with_records(fitted.problem.records), own, values)
-    others = tuple(one.name for one in chosen.others)
+    gaining, others = freeing(wide.with_records(fitted.problem.records), own, values)
+    determined = tuple(one.name for one in others)
     unit = error_unit(ready.problem)
-    if not chosen.gaining:
-        return FixedParameters(unit, None, (), (), others)
+    if not gaining:
+        return FixedParameters(unit, None, (), (), determined)
     splits = folds(len(train), _FOLDS, 0, experiment.poses(ready.dataset.subset(train)))
-    names = [one.name for one in chosen.gaining]
+    names = [one.name for one in gaining]
 
     def errors_with(count: int) -> Array:
         problem = wide.with_parameters(parameters.with_free([*own, *names[:count]]))
@@ -79,7 +79,7 @@ def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress
             best = count
     means = {count: 1000 * float(np.mean(error)) for count, error in errors.items()}
     steps = []
-    for i, one in enumerate(chosen.gaining, 1):
+    for i, one in enumerate(gaining, 1):
         numbers = (tuple(one.change.tolist()), tuple(one.sd.tolist()), one.p_value)
         steps.append(FreedStep(one.name, parameters[one.name].unit, *numbers, means.get(i), i <= best))
-    return FixedParameters(unit, means[0], tuple(steps), tuple(names[:best]), others)
+    return FixedParameters(unit, means[0], tuple(steps), tuple(names[:best]), determined)

@@ -111,10 +111,8 @@ def metrics(result: RunResult) -> dict[str, Any]:
         },
         "parameters": {
             "free": len(known),
-            "determined": known.rank,
-            "held_by_priors": [
-                n for n, seen in zip(estimate.names, estimate.identified_by_data, strict=True) if not seen
-            ],
+            "rank": known.rank,
+            "determined_by": estimate.sources,
             "at_bound": list(estimate.at_bound),
             "undetermined": [str(combination) for combination in known.undetermined],
             "scaled_condition": finite(float(known.condition)),

@@ -13,7 +13,7 @@ import numpy as np
 from armcal.arm.effects import JointEffect
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset, SetAside
-from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record, stretch_records
+from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record
 from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
 from armcal.diagnose.checks import DATA_CHECKS, first_few, plugin_checks
 from armcal.diagnose.coverage import fit_and_predict, intervals
@@ -79,7 +79,7 @@ def calibrate(
     faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
     faults += _notify_rejected(registry, ready.dataset.set_aside)
     context = RunContext(experiment, progress, executor, watch)
-    with noted(ready.warnings):
+    with noted(ready.notices):
         plain = Fit(ready, fitted(context, ready), experiment.estimator)
     faults += registry.notify("armcal_estimate_changed", estimate=plain.estimate)
     learned, outcome = with_pose_residual(context, plain)
@@ -103,7 +103,7 @@ def prepare(
         InputError: data, units, counts or rank do not allow a calibration.
     """
     ready = assemble(experiment, watch, accept, progress, dataset)
-    with watch.stage("check"), noted(ready.warnings):
+    with watch.stage("check"), noted(ready.notices):
         problems = require_solvable(ready.training, ready.problem.parameters.nominal())
     return replace(ready, warnings=(*ready.warnings, *problems))
 
@@ -166,7 +166,7 @@ def _checked(
         findings = check.findings(ready)
         for finding in findings:
             if finding.grade == "bad" and not accept:
-                why = "" if check.plugin else _FAR_OFF
+                why = _FAR_OFF if check.name == "axes" else ""
                 hint = f"{finding.action} If the data are right, {why}calibrate as it stands: armcal run --accept."
                 raise DataError(finding.text, where=Location(dataset.source), hint=hint)
         ready = replace(ready, findings=(*ready.findings, *findings))
@@ -180,12 +180,11 @@ def _checked(
     problem = restricted(ready.training).with_records(problem.records)
     profiled(problem, settings.uncertainty.profile)
     named = mislabelled(ready.problem, dataset)
-    warned = [finding.text for finding in ready.findings if finding.grade == "warning"]
     return replace(
         ready,
         problem=problem,
         folds=experiment.folds(ready.trained),
-        warnings=(*experiment.warnings, *dataset.warnings, *start.warnings, *named, *warned),
+        warnings=(*experiment.warnings, *dataset.warnings, *start.warnings, *named),
         limit_mm=None if limit is None else limit * _MM,
         limits={} if plan is None else {**plan.limits, **plan.travel_limits},
     )
@@ -330,7 +329,7 @@ def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | Non
     return PredictionRecord(
         entries=own.estimate.names,
         covariance=covariance_rows(own.estimate.covariance),
-        stretches=stretch_records(own.of(intervals).stretches),
+        stretches=dict(own.of(intervals).stretches),
         columns={str(name): str(local) for name, local in columns.items()},
         recording=recording_record(own.fitted.problem, own.ready.trained),
         ranges=ranges,

@@ -21,13 +21,12 @@ from armcal.base.parameters import Parameters
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.identifiability import Identifiability, analyse, measures_of
+from armcal.estimate.identifiability import Identifiability, analyse, deviations, measures_of
 from armcal.estimate.simulation import with_channels
 from armcal.measure.groups import grouped_instances
 from armcal.planning.candidates import (
     Candidates,
     Observability,
-    deviations,
     efficiency,
     observability,
     value_of,

@@ -161,7 +161,7 @@ class ErrorTable:
 
     def as_dict(self) -> dict[str, Any]:
         return {
-            model: {name: summary.as_dict() for name, summary in table.items()}
+            model: {name: asdict(summary) for name, summary in table.items()}
             for model, table in (("nominal", self.nominal), ("calibrated", self.calibrated), ("at_rest", self.at_rest))
             if table
         }

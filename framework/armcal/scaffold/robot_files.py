@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal.arm.statics import plausible_compliance
 from armcal.base.dataset import Dataset
 from armcal.base.domains import Rotation
 from armcal.base.parameters import Parameters
@@ -45,7 +46,6 @@ MOST_ERROR = 1.5  # times what the noise alone makes: what misses held-out tips 
 NOISE_ALONE_MM = NOISE_MM * math.sqrt(8 / math.pi)  # mean length of three independent normal numbers
 SEED = 1
 LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
-SAG_RAD = 0.002  # what a joint gives under half the moment that the arm's whole weight has at its full reach
 UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03}
 """Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
 _MOST_SD = 2.0
@@ -211,7 +211,7 @@ def _made_up(
         block = parameters[name]
         if block.unit == "rad_per_Nm":
             drawn = float(random.uniform(*_SPRING))
-            error = drawn * SAG_RAD / (0.5 * load_Nm) if load_Nm > 0 else 0.0
+            error = drawn * plausible_compliance(load_Nm) if load_Nm > 0 else 0.0
         else:
             error = deviations[block.unit] * float(np.clip(random.normal(), -_MOST_SD, _MOST_SD))
         values[name] = float(block.nominal[0]) + error + target.get(name, 0.0)

@@ -31,7 +31,9 @@ def started(
 ) -> dict[str, Any]:
     """At the beginning; ``slowest``: the rates (rad or m a day) of gradual changes that a week of records names."""
     rates = {name: SHOWN[f"{steps.dimension(name) or 'length'} a day"] for name in slowest}
-    blocks = {name: block.entry_unit for block in setup.space.parameters.free for name in block.entry_names}
+    blocks = {
+        n: unit for b in setup.space.parameters.free for n, unit in zip(b.entry_names, b.entry_units, strict=True)
+    }
     return {
         **_event("started", state),
         "level": state.health.level,

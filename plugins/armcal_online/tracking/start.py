@@ -18,6 +18,7 @@ from armcal.calibration.intervals import covariance_rows
 from armcal.calibration.physics import under_load
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
+from armcal.estimate.estimator import interval
 from armcal.estimate.online import Gaussian
 from armcal.measure.groups import PairedMeasurement
 from armcal.measure.measurement import Measurement
@@ -307,12 +308,13 @@ def _parameter_records(
         changed: dict[str, Any] = {"value": float(values[i])}
         if i in sd:
             low, high = bounds.get(i, (-np.inf, np.inf))
+            own = interval(values[i], free[i], sd[i], low, high, _QUANTILE)
             is_moved = abs(free[i] - values[i]) > UNMOVED_SD * sd[i]
             changed |= {
                 "free": True,
                 "sd": sd[i],
-                "lower": float(np.clip(free[i] - _QUANTILE * sd[i], low, high)),
-                "upper": float(np.clip(free[i] + _QUANTILE * sd[i], low, high)),
+                "lower": own.lower,
+                "upper": own.upper,
                 "at_bound": bool(values[i] <= low or values[i] >= high),
                 "unconstrained": float(free[i]) if is_moved else None,
             }

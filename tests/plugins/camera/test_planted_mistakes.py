@@ -9,8 +9,8 @@ import pytest
 import yaml
 from armcal.base.dataset import Dataset
 from armcal.errors import ProblemError
+from armcal.estimate.identifiability import deviations
 from armcal.measure.csv_writer import write_csv
-from armcal.planning.candidates import deviations
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from scipy.spatial.transform import Rotation
