@@ -115,7 +115,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
     there = (*ports, *overrides_for(folder / "bench", "device"))
     desk, bench, careful = Terminal(folder), Terminal(folder, there), Terminal(folder, (*there, *NARROWER))
     desk("plan", config, "--poses", str(POSES), "--out", folder / "plan.csv")
-    fresh = Terminal(folder, ("plan.seed=5", "plan.starts=1", "plan.goal=A", *NARROWER))
+    fresh = Terminal(folder, ("plan.seed=5", "plan.starts=1", *NARROWER))
     fresh("plan", config, "--poses", str(FRESH), "--out", folder / "fresh.csv")
 
     def acquire(plan: str, out: str, by: Terminal = bench, code: int = 0) -> str:
