@@ -103,9 +103,10 @@ def _digest(file: Path) -> str:
 class _Loader(SourceFileLoader):
     """Leaves no compiled file beside the source, whose age could not tell two edits of one second apart."""
 
-    def exec_module(self, module: ModuleType) -> None:
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = ModuleType(spec.name)  # with its digest before another thread can meet it in sys.modules
         module.armcal_digest = _digest(Path(self.path))  # type: ignore[attr-defined]
-        super().exec_module(module)
+        return module
 
     def get_code(self, fullname: str) -> CodeType:
         return self.source_to_code(self.get_data(self.path), self.path)
@@ -127,7 +128,7 @@ def _import_file(module: str, file: Path) -> ModuleType:
     """Import a plugin's file, anew where it is another than before."""
     known = sys.modules.get(module)
     if known is not None and (known.__file__, known.armcal_digest) != (str(file), _digest(file)):
-        del sys.modules[module]
+        sys.modules.pop(module, None)  # another thread may have been faster
     try:
         return importlib.import_module(module)
     except (Exception, SystemExit) as fault:  # whatever a user's file does, it is told where

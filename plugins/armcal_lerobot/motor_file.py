@@ -25,6 +25,7 @@ _LONGER_DEG, _SAME_DEG, _NARROW_DEG = 60.0, 6.0, 40.0
 Units = Literal["degrees", "percent"]
 
 LAST_COUNT = 4095
+_LAST_OF_SMALL = 1023  # Of Feetech SCS servos; LeRobot homes an STS servo's range about the middle of 4096 counts
 COUNTS_A_TURN = 4096
 LARGEST_OFFSET = 2047
 DEGREES_A_COUNT = 360 / LAST_COUNT  # As LeRobot has it; a count of the encoder itself is 360 / 4096 deg
@@ -167,6 +168,9 @@ def read_motors(path: Path) -> MotorFile:
     if not isinstance(entries, dict) or not entries:
         _refuse(path, "", f"found {json.dumps(entries)[:40]}, expected a key a motor.", hint)
     motors = {name: _motor(path, name, entry) for name, entry in entries.items()}
+    if all(motor.range_max <= _LAST_OF_SMALL and not motor.homing_offset for motor in motors.values()):
+        text = f"found counts of at most {_LAST_OF_SMALL} and no homing offset, expected counts of 0 to {LAST_COUNT}: "
+        _refuse(path, "", f"{text}these servos have 1,024 counts a turn, or it states degrees.", _READS)
     owners: dict[int, str] = {}
     for name, motor in motors.items():
         if (other := owners.setdefault(motor.id, name)) != name:

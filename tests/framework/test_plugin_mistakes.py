@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 
 import pytest
@@ -306,6 +307,13 @@ def test_a_fault_is_placed_in_any_process(tmp_path: Path) -> None:
     for work in (lambda: Workers("threading", 2).map(_work, [1, 2]), lambda: [blaming(_work)(1)]):
         with pytest.raises(PluginError, match=r"mine.py:\d+: E.displacement raised AttributeError: 'int' object"):
             work()
+
+
+def test_another_thread_meets_no_plugin_without_its_digest(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(EFFECT, encoding="utf-8")
+    use_plugins(tmp_path / "mine.py")
+    spec = find_spec("armcal.plugins.mine")
+    assert spec is not None and module_from_spec(spec).armcal_digest.startswith("sha256 ")  # before its code has run
 
 
 def test_armcals_own_faults_keep_their_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

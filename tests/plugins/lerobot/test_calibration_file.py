@@ -53,6 +53,7 @@ OTHERS = [
     dict.fromkeys(("shoulder_pan", "elbow_flex"), DEGREES),
     {"shoulder_pan": {"range_min": 0, "range_max": 4095, "homing_offset": 3072}},
     {"elbow_flex": {"range_min": -700, "range_max": 4000}},
+    {"finger": {"homing_offset": 0, "range_min": 80, "range_max": 1020}, "thumb": {**DEGREES, "range_min": 0}},
 ]
 
 
