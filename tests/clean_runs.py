@@ -23,6 +23,7 @@ from armcal.base.parameters import Parameters
 from armcal.base.units import shown_unit
 from armcal.cli.main import cli
 from armcal.config.yaml_source import load_config
+from armcal.diagnose.checks import DATA_CHECKS, FIT_CHECKS
 from armcal.errors import ArmcalError
 from armcal.estimate.simulation import SimulationRequest
 from armcal.measure.csv_writer import write_csv
@@ -77,8 +78,13 @@ class Outcome:
     seed: int
     records: int
     grade: str
-    said: tuple[str, ...]
+    said: tuple[str, ...]  # of each check that warned, with its name before it
     seconds: float
+
+    @property
+    def checks(self) -> set[str]:
+        """Names of the checks that warned."""
+        return {text.partition(":")[0] for text in self.said}
 
 
 def _new(*words: str | Path) -> None:
@@ -188,13 +194,20 @@ def run(kind: str, seed: int, config: Path) -> Outcome:
     data = config.parent / "clean.csv"
     write_csv(data, dataset, list(requested_channels(system.arms, system.measurements, measured=True)))
     try:
-        found = calibrate(Experiment.load(config, (), data)).verdict.findings
+        result = calibrate(Experiment.load(config, (), data))
     except ArmcalError as fault:
         return Outcome(kind, seed, len(dataset), "refused", (str(fault),), time.process_time() - began)
-    concerns = [finding for finding in found if finding.grade in ("bad", "warning")]
-    grade = concerns[0].grade if concerns else "good"
-    said = tuple(f"{finding.grade}: {finding.text} [{finding.test}]" for finding in concerns)
-    return Outcome(kind, seed, len(dataset), grade, said, time.process_time() - began)
+    seconds = time.process_time() - began
+    grades = [finding.grade for finding in result.verdict.findings]
+    grade = next((own for own in ("bad", "warning") if own in grades), "good")
+    subjects = [*((check, result.fit.ready) for check in DATA_CHECKS), *((check, result.fit) for check in FIT_CHECKS)]
+    said = tuple(
+        f"{check.name}: {finding.grade}: {finding.text} [{finding.test}]"
+        for check, subject in (subjects if grade != "good" else ())
+        for finding in check.findings(subject)
+        if finding.grade in ("bad", "warning") and check.name != "before"
+    )
+    return Outcome(kind, seed, len(dataset), grade, said, seconds)
 
 
 def main() -> None:
@@ -217,11 +230,8 @@ def main() -> None:
         own = [outcome for outcome in outcomes if outcome.kind == kind]
         seconds = sum(outcome.seconds for outcome in own)
         print(f"{kind:10} {dict(Counter(outcome.grade for outcome in own))} of {len(own)}, {seconds:.0f} s", flush=True)
-        said = Counter(
-            text[:90] for outcome in own for text in {"".join(c for c in s if not c.isdigit()) for s in outcome.said}
-        )
-        for text, count in said.most_common(12):
-            print(f"    {count:4} {text}", flush=True)
+        for name, count in Counter(name for outcome in own for name in outcome.checks).most_common():
+            print(f"    {count:4} {name}", flush=True)
 
 
 if __name__ == "__main__":

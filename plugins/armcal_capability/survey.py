@@ -33,8 +33,7 @@ from armcal.config.yaml_source import ConfigSource, load_config, load_variants
 from armcal.errors import ConfigError, Location, ProblemError
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 from armcal.plugins import PluginRegistry
-from armcal.run.plan_clearance import clearance_check
-from armcal.run.settings import PlanSettings
+from armcal.run.experiment import PlanSettings, clearance_check
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 

@@ -11,7 +11,7 @@ import oracle
 import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.causes import predicted_positions
-from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.fit import FitRows
 from armcal.diagnose.residual_structure import LEVEL, UNLISTED, neighbour_findings, structure, structure_findings
 from armcal.diagnose.unseen import scale_deviation
 from armcal.estimate.robust import fit

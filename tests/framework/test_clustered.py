@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.diagnose.fit_rows import widened
+from armcal.diagnose.fit import widened
 from armcal.diagnose.residual_structure import _what_neighbours_cost
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels

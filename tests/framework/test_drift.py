@@ -12,7 +12,7 @@ import oracle
 import pytest
 from armcal.base.parameters import Drift
 from armcal.cli.main import cli
-from armcal.diagnose.held import contradictions
+from armcal.diagnose.causes import contradictions
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.unseen import rounding
 from armcal.diagnose.verdict import LEVEL, _good_for, _size

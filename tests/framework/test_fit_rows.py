@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import contact_oracle as co
 import numpy as np
-from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.fit import FitRows
 from armcal.estimate.polish import started
 from armcal_contact.contacts import BallInSocket
 from armcal_ipopt.estimator import IpoptEstimator

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.diagnose.fit_rows import FitRows
-from armcal.diagnose.held import HeldParameter, clustered_variance
+from armcal.diagnose.causes import HeldParameter, clustered_variance
+from armcal.diagnose.fit import FitRows
 from armcal.diagnose.residual_structure import structure
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate

@@ -12,8 +12,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.problem.problem import Problem
-from armcal.run.experiment import Experiment
-from armcal.run.plan_clearance import clearance_check
+from armcal.run.experiment import Experiment, clearance_check
 from armcal.run.plan_poses import JointSpace, spread
 from click.testing import CliRunner, Result
 

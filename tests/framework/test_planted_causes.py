@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.fit import FitRows
 from armcal.diagnose.residual_structure import (
     Contest,
     ResidualStructure,

@@ -26,7 +26,7 @@ from armcal.diagnose.coverage import (
     stretch,
     whitened_like,
 )
-from armcal.diagnose.fit_rows import widened
+from armcal.diagnose.fit import widened
 from armcal.errors import DataError
 from armcal.estimate.prediction import LEVELS, Spread
 from armcal.estimate.robust import fit

@@ -20,10 +20,10 @@ from armcal.base.dataset import Dataset, SetAside
 from armcal.base.domains import Interval, Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.config.system import StaticsSettings, System
+from armcal.diagnose.causes import contradictions
 from armcal.diagnose.coverage import IntervalResult, intervals
 from armcal.diagnose.fit import Fit, Prepared, RecordErrors
-from armcal.diagnose.held import contradictions
-from armcal.diagnose.outliers import large_errors, noise_of, suspicious
+from armcal.diagnose.outliers import large_errors, noise_of, outlying
 from armcal.diagnose.residual_structure import depends, structure
 from armcal.diagnose.unseen import determined, elsewhere, hidden_payload, priors_alone, rounding
 from armcal.diagnose.verdict import (
@@ -153,7 +153,7 @@ def result_of(
     )
     found = estimate_of(parameters or blocks(), freedom=max(3 * count - 28, 1), undetermined=undetermined)
     fit = fit_known(found, errors, split, _dataset(count, position, ids))
-    checks = (converged, determined, conditioned, bounds, shifts, noise, freedom, depends, correlated, suspicious)
+    checks = (converged, determined, conditioned, bounds, shifts, noise, freedom, depends, correlated, outlying)
     return RunResult(
         name=name,
         command="armcal calibrate configs/picobot.yaml --out runs/picobot",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, replace
 from functools import lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -12,10 +13,10 @@ import pytest
 from armcal.arm.loading import site_loads
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
-from armcal.diagnose.fit_rows import FitRows, own_basis
+from armcal.diagnose.causes import Functions
+from armcal.diagnose.fit import FitRows, own_basis
 from armcal.diagnose.outliers import large_errors
 from armcal.diagnose.residual_structure import DRAWS, LEVEL, MOST_RECORDS, Contest, structure
-from armcal.diagnose.smooth import Functions
 from armcal.diagnose.unseen import determined_finding, priors_alone, tip_by_priors, unseen_poses
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
@@ -370,7 +371,8 @@ def large_errors_of(lrm, spoil, limit=None):
     dataset = replace(dataset, channels=columns)
     problem = problem.of(dataset)
     errors = 1000 * np.linalg.norm(problem.residuals(found.values)[0], axis=0)
-    return large_errors(fit_of(problem, found, dataset, limit_mm=limit, judged_mm=errors))
+    known = {"judged_mm": errors, "errors": SimpleNamespace(calibrated_mm=errors)}
+    return large_errors(fit_of(problem, found, dataset, limit_mm=limit, **known))
 
 
 @pytest.mark.slow

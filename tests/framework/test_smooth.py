@@ -10,7 +10,8 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.fit_rows import FitRows
+from armcal.diagnose.causes import Functions, Recorded, Smooth
+from armcal.diagnose.fit import FitRows
 from armcal.diagnose.residual_structure import (
     FEWEST_POSES,
     Contest,
@@ -18,7 +19,6 @@ from armcal.diagnose.residual_structure import (
     structure,
     structure_findings,
 )
-from armcal.diagnose.smooth import Functions, Recorded, Smooth
 from armcal.estimate.robust import fit
 from armcal.measure.groups import pose_numbers
 from armcal.problem.motion import Motion

@@ -23,8 +23,7 @@ from armcal.config.servo_file import load_servo_file
 from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.simulated import BenchRequest
 from armcal.io.json_server import JsonServer
-from armcal.run.experiment import Experiment
-from armcal.run.plan_clearance import clearance_check
+from armcal.run.experiment import Experiment, clearance_check
 from armcal_simulation.bench.parts import ServoBenchSettings
 from armcal_simulation.bench.world import BenchWorld
 from armcal_simulation.boards.servo_bench import PulseBench, ServoBench

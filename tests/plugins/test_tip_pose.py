@@ -10,11 +10,10 @@ from armcal.base import se3
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, PlanSettings
 from armcal.run.pipeline import calibrate
 from armcal.run.plan import PlanContext
 from armcal.run.plan_poses import JointSpace
-from armcal.run.settings import PlanSettings
 from armcal_tracker.position import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation

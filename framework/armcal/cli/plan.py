@@ -15,11 +15,10 @@ from armcal.errors import ConfigError, InputError, Location
 from armcal.estimate.identifiability import Measure
 from armcal.measure.csv_writer import write_csv
 from armcal.report.document import Document, Section, Table
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, PlanSettings
 from armcal.run.iso_plan import NAMES, POINTS, make_iso_plan
 from armcal.run.plan import PlanResult, make_plan
 from armcal.run.plan_poses import counts_text, stated_beyond
-from armcal.run.settings import PlanSettings
 
 _SHOWN = 8
 _LARGEST_CUBE_MM = 10_000.0

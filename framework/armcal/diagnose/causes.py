@@ -1,26 +1,209 @@
-"""What residuals might still depend on: order, joint levels, approach, torques, payload, temperature; steps and scales.
+"""What residuals might still depend on: parameters that instruments hold, causes, smooth functions of the records.
 
-Each cause is a set of columns: how residuals would move with it, to first order, along the motion of one joint, along
-the residual's own entries (base axes for a position), or along the turning of one site.
+A parameter of an instrument that a fit holds, a board's size, how it is bent, a lens, is estimated beside the free
+parameters, to first order at the fit. Rows of one record may err alike, as the corners of an image do: the deviation is
+that of sums over records, each residual divided by the root of what the fit left of it, and the t-test counts how few
+records bear it. [Bell2002]
+
+A cause (order, joint levels, approach, torques, payload, temperature; steps and scales) is a set of columns: how
+residuals would move with it, to first order, along the motion of one joint, along the residual's own entries (base axes
+for a position), or along the turning of one site.
+
+A smooth function is a sum of harmonics whose coefficients shrink as those of a smooth random function would
+[Rasmussen2006]: of each joint's angle along the joint's own motion, and of joints, pairs of them and all of them along
+the residual's entries; whatever the cause. Its odds against noise are those of its marginal likelihood; what of a
+record it predicts from the records of other poses is what is not noise.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.linalg import eigh
+from scipy.special import stdtr
 
-from armcal.arm.assembly import Arm, shown_joint
+from armcal.arm.assembly import Arm, command_channels, shown_joint
 from armcal.arm.effects import joint_rate
 from armcal.arm.loading import SiteLoads
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
-from armcal.diagnose.held import Moves
-from armcal.estimate.identifiability import candidates
-from armcal.measure.measurement import NamesMistakes
+from armcal.diagnose.checks import Finding
+from armcal.diagnose.fit import Fit, FitRows, thinned, unbiased_roots
+from armcal.estimate.identifiability import Measure, candidates
+from armcal.measure.measurement import HasScale, Mistake, NamesMistakes
 from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
+
+Moves = Mapping[str, tuple[Array, ...]]
+"""How raw residuals move with each increment of a parameter, by its name (n_r x N x k a factor)."""
+MOST_RECORDS = 60
+MISTAKEN = 0.001  # Level of each parameter that a mistake names
+OFF = 0.05  # Level of a scale, on which every length depends
+_DETERMINED = 1e-6
+_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class HeldParameter:
+    name: str  # in full
+    unit: str  # SI
+    value: float  # at which it is held
+    off: float  # by how much it should differ from that
+    sd: float  # standard deviation of that, rows of a record that err alike counted; infinite if records do not show it
+    freedom: float  # degrees of freedom of that deviation
+
+    @property
+    def p_value(self) -> float:
+        return 2 * float(stdtr(self.freedom, -abs(self.off) / self.sd))
+
+    def __str__(self) -> str:
+        shown = Measure(self.unit, 1.0).shown
+        (held, unit), (there, _), (sd, _) = map(shown, (self.value, self.value + self.off, self.sd))
+        digits = int(np.clip(1 - np.floor(np.log10(max(sd, 1e-9))), 0, 9))
+        at, put = f"{held:.6g} {unit}".rstrip(), f"{there:.{digits}f} +- {sd:.{digits}f} {unit}".rstrip()
+        return f"{self.name} is held at {at}, but the records put it at {put}"
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A mistake with an instrument that records show: ``words`` says which, ``check`` what to do about it."""
+
+    words: str
+    check: str
+    parameters: tuple[HeldParameter, ...]
+
+
+def contradictions(fit: Fit) -> tuple[Contradiction, ...]:
+    """Mistakes that instruments name and that are there always.
+
+    Each parameter is judged beside all others of such mistakes, so that a lens does not pass for a bent board.
+    """
+    if not fit.converged:
+        return ()
+    problem, named = fit.problem, list[tuple[Mistake, str, list[str]]]()
+    many = len(problem.blueprint.measurements) > 1
+    for instance, measurement in problem.blueprint.measurements.items():
+        for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
+            if one.course == "always":
+                own = [problem.parameters[f"{instance}.{name}"] for name in one.parameters]
+                words = f"{instance}: {one.words}" if many else one.words
+                named.append((one, words, [block.name for block in own if not block.free]))
+    judged = _held_parameters(fit, problem, [name for *_, names in named for name in names])
+    off = {name: one for name, one in judged.items() if one.p_value < MISTAKEN}
+    return tuple(
+        Contradiction(words, mistake.measure, tuple(off[name] for name in names if name in off))
+        for mistake, words, names in named
+        if not off.keys().isdisjoint(names)
+    )
+
+
+def with_contradicted(fit: Fit, problem: Problem) -> Problem:
+    return freed(problem, [parameter.name for one in fit.of(contradictions) for parameter in one.parameters])
+
+
+def held_scales(fit: Fit) -> list[tuple[HeldParameter, str]]:
+    problem = with_contradicted(fit, fit.problem)
+    scaled = [(f"{n}.{m.scale}", m) for n, m in problem.blueprint.measurements.items() if isinstance(m, HasScale)]
+    checks = {n: m.scale_check for n, m in scaled if n in problem.parameters.names and not problem.parameters[n].free}
+    return [(one, checks[name]) for name, one in _held_parameters(fit, problem, list(checks)).items()]
+
+
+def _held_parameters(fit: Fit, problem: Problem, names: Sequence[str]) -> dict[str, HeldParameter]:
+    """Where records put parameters of one number each that a fit held, by name, each beside the others."""
+    if not names:
+        return {}
+    some = fit.acting.subset(thinned(np.arange(fit.acting.count), MOST_RECORDS))
+    estimate, wider = fit.estimate, freed(problem, names).with_records(some.records)
+    rows, coordinates = FitRows.of(wider, estimate), wider.parameters.coordinate_names
+    lengths = np.maximum(np.linalg.norm(rows.slopes, axis=0), 1e-300)
+    left, sizes, right = np.linalg.svd(rows.slopes / lengths, full_matrices=False)
+    kept, at = sizes > _RANK * sizes[0], [coordinates.index(name) for name in names]
+    basis = left[:, kept]
+    sums = (right[kept].T / sizes[kept])[at] @ basis.T / lengths[at, None]
+    known = np.sum(right[kept][:, at] ** 2, axis=0) > 1 - _DETERMINED
+    variance, freedom = clustered_variance(rows, basis, sums, estimate.noise_scale)
+    units = wider.parameters.scales()[at]
+    off, sd = -sums @ rows.residual * units, np.where(known, np.sqrt(variance) * units, np.inf)
+    values = [float(estimate.values[wider.parameters.entries_of(name)][0]) for name in names]
+    numbers = zip(names, values, off.tolist(), sd.tolist(), freedom.tolist(), strict=True)
+    return {
+        name: HeldParameter(name, problem.parameters[name].unit, value, by, deviation, spare)
+        for name, value, by, deviation, spare in numbers
+    }
+
+
+def clustered_variance(rows: FitRows, basis: Array, sums: Array, noise_scale: float) -> tuple[Array, Array]:
+    """Variances of sums (k x rows) of a fit's rows, and their degrees of freedom (Satterthwaite's).
+
+    The fit took up an orthonormal ``basis``. No variance is less than that of independent rows; priors are as wide as
+    they state.
+    """
+    data = len(rows.record_of)
+    whole = rows.residual - basis @ (basis.T @ rows.residual)
+    own, taken = list[Array](), list[Array]()
+    by_records = np.zeros(len(sums))
+    for record, root in unbiased_roots(rows, basis):
+        weighed = sums[:, record] @ root
+        by_records += (weighed @ whole[record]) ** 2
+        own.append(np.sum(weighed**2, axis=1))
+        taken.append(weighed @ basis[record])
+    sizes, across = np.array(own), np.einsum("gkn,hkn->kgh", taken, taken, optimize=True)
+    pairs = np.einsum("gk,gh->kgh", sizes, np.eye(len(sizes))) - across
+    freedom = np.trace(pairs, axis1=1, axis2=2) ** 2 / np.maximum(np.sum(pairs**2, axis=(1, 2)), 1e-300)
+    by_priors, apart = np.sum(sums[:, data:] ** 2, axis=1), np.sum(sums[:, :data] ** 2, axis=1)
+    freedom *= ((by_records + by_priors) / np.maximum(by_records, 1e-300)) ** 2
+    return np.maximum(by_records, noise_scale**2 * apart) + by_priors, np.maximum(freedom, 1.0)
+
+
+def freed(problem: Problem, names: Sequence[str]) -> Problem:
+    """The problem as a function of fixed parameters too; its records serve both.
+
+    Components that, once free, read a channel that these records lack (the approach, for play held at none) stay fixed.
+    """
+    if not names:
+        return problem
+    plan = problem.blueprint
+    parameters = plan.parameters.with_free([*(block.name for block in plan.parameters.free), *names])
+    plan, kept = replace(plan, parameters=parameters), ("channels", "output_channels", "noise", "dimensions", "points")
+    kernels = plan.kernels(0, dict.fromkeys(plan.measurements, "interpreted"))
+    pairs = [*zip(kernels, problem.kernels, strict=True)]  # of the points that are looked at, which may be few
+    if any(k.channels[: k.shared] != own.channels[: own.shared] for k, own in ((a.factor, b.factor) for a, b in pairs)):
+        owners = dict.fromkeys(name.rpartition(".")[0] for name in names)
+        parts = [[name for name in names if name.rpartition(".")[0] == owner] for owner in owners]
+        alike = [name for part in parts if len(parts) > 1 and freed(problem, part) is not problem for name in part]
+        return freed(problem, alike)
+    same = (replace(k, factor=replace(k.factor, **{n: getattr(own.factor, n) for n in kept})) for k, own in pairs)
+    compiled = replace(problem.compiled, parameters=parameters, kernels=tuple(same), blueprint=plan)
+    return replace(problem, compiled=compiled)
+
+
+def moves_of(problem: Problem, values: Array, held: Sequence[str]) -> Moves:
+    wider = freed(problem, held)
+    bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in problem.records]
+    chain, parts = wider.parameters.entries_jacobian(values), []
+    for kernel, block in zip(wider.kernels, wider.with_records(bare).jacobians(values), strict=True):
+        noise = np.array(kernel.factor.noise)[:, None, None]
+        parts.append(noise * np.einsum("rvn,vc->rnc", block, chain))
+    return {name: tuple(part[:, :, own] for part in parts) for name, own in wider.parameters.coordinates_of.items()}
+
+
+def instruments(fit: Fit) -> list[Finding]:
+    findings = []
+    for one in fit.of(contradictions):
+        text = f"{one.words[:1].upper()}{one.words[1:]}: {'; '.join(map(str, one.parameters))} (1 sd)."
+        freedom = min(parameter.freedom for parameter in one.parameters)
+        test = (
+            f"beside the free parameters and others that instruments hold, records as clusters; t, at least "
+            f"{freedom:.0f} degrees of freedom, {100 * MISTAKEN:g} % each"
+        )
+        free = f"or free {', '.join(parameter.name for parameter in one.parameters)} (parameters.free) with a prior"
+        findings.append(Finding("warning", text, test, f"{one.check}; {free}."))
+    return findings
+
 
 MOST_LEVELS = 12  # Levels of a joint are separated one by one up to so many; beyond, by a cubic
 _SLOW = 3
@@ -435,3 +618,233 @@ def _places(count: int, most: int) -> list[int]:
     inner = np.arange(_FEWEST_APART, count - _FEWEST_APART + 1)
     step = max(_FEWEST_APART, -(-len(inner) // most))
     return [int(i) for i in inner[step // 2 :: step]]
+
+
+WILD = 3.0  # A record farther off than so many medians counts as one that is as far off
+_FINE, _COARSE = 30, 3  # Highest harmonics: of time and of a joint along its own motion, of anything else
+_RECORDS_PER_HARMONIC = 6
+_MOST_ALONG, _MOST_ENTRIES = 300, 180  # So many columns at most: of all joints along their own motion, of the entries
+_POSE_LENGTHS = (1.0, 2.0)  # In chords of all joints' angles
+_SMALLEST = 1e-4
+_RATIOS = np.logspace(-4, 3, 29)
+_RIDGE = 0.05
+
+
+@dataclass(frozen=True)
+class Input:
+    """What was recorded: a joint, the side it was approached from, time, payload or temperature."""
+
+    kind: str  # ``joint``, ``approach``, ``time``, ``payload`` or ``temperature``
+    name: str  # of the joint, with its arm where there are several; empty where it is none
+    channel: str
+    angle: Array  # On a circle, or on half of one where it does not close (N; rad)
+
+    @property
+    def words(self) -> str:
+        of = {"joint": f"the angle of {self.name}", "approach": f"the side {self.name} was approached from"}
+        return of.get(self.kind, f"the {self.kind}" if self.kind != "time" else "time")
+
+
+@dataclass(frozen=True)
+class Functions:
+    """Functions of some inputs: columns whose coefficients are alike in size (rows x k).
+
+    Attributes:
+        features: the same of each record, whichever entry they move (N x r).
+    """
+
+    columns: Array
+    features: Array
+
+    def imitate(self, function: Array) -> float:
+        """Which share of a function (N x n_r) they predict of a record from the others."""
+        centred = function - function.mean(axis=0)
+        total, kernel = float(np.sum(centred**2)), self.features @ self.features.T
+        if not total or not np.any(kernel):
+            return 0.0
+        inverse = np.linalg.inv(kernel / np.mean(np.diag(kernel)) + _RIDGE * np.eye(len(kernel)))
+        left = inverse @ centred / np.diag(inverse)[:, None]
+        return max(0.0, 1 - float(np.sum(left**2)) / total)
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """The likeliest of some functions, free of what a fit takes up."""
+
+    basis: Array  # of the fit (rows x n), orthonormal
+    parts: tuple[tuple[Array, Array], ...]  # an orthonormal basis of each (rows x m), and how large it is along it (m)
+
+    @classmethod
+    def of(cls, functions: Sequence[Functions], basis: Array) -> "Smooth":
+        parts = []
+        for one in functions:
+            columns = one.columns - basis @ (basis.T @ one.columns)
+            values, vectors = eigh(columns.T @ columns)
+            kept = values > 1e-9 * max(float(values[-1]), 1e-300)
+            parts.append((columns @ (vectors[:, kept] / np.sqrt(values[kept])), values[kept]))
+        return cls(basis, tuple(parts))
+
+    def gains(self, residuals: Array) -> Array:
+        """Logarithms of the odds of the likeliest function in each residual (rows x m), against noise alone (m)."""
+        return np.asarray(np.max([self._by_ratio(*part, residuals).max(axis=0) for part in self.parts], axis=0))
+
+    def evidence(self, residual: Array) -> float:
+        """The logarithm of the odds in one residual (rows), the choice of a ratio paid for."""
+        return float(self.gains(residual[:, None])[0] - np.log(self._freedom))
+
+    def predicted(self, residual: Array, groups: Sequence[Indices]) -> tuple[Array, float]:
+        """The likeliest function in a residual (rows), and which share of squares it predicts.
+
+        Of each group of rows by the others, as compared with the fit alone; wild ones are bounded.
+        """
+        gains = [self._by_ratio(*part, residual[:, None])[:, 0] for part in self.parts]
+        best = int(np.argmax([own.max() for own in gains]))
+        (axes, sizes), ratio = self.parts[best], _RATIOS[int(np.argmax(gains[best]))]
+        taken = ratio * sizes / (1 + ratio * sizes)
+        function, hat = axes @ (taken * (axes.T @ residual)), axes * np.sqrt(taken)
+        missed = np.zeros((2, len(groups)))  # with the function, and without it
+        for i, own in enumerate(groups):
+            kept = (1 + 1e-9) * np.eye(len(own)) - self.basis[own] @ self.basis[own].T
+            left = np.linalg.solve(kept - hat[own] @ hat[own].T, (residual - function)[own])
+            missed[:, i] = np.linalg.norm(left), np.linalg.norm(np.linalg.solve(kept, residual[own]))
+        bounded = np.minimum(missed, WILD * max(float(np.median(missed[1])), 1e-300))
+        with_it, without = np.sum(bounded**2, axis=1)
+        return function, float(1 - with_it / max(without, 1e-300))
+
+    @property
+    def _freedom(self) -> int:
+        return int(len(self.basis) - self.basis.shape[1])
+
+    def _by_ratio(self, axes: Array, sizes: Array, residuals: Array) -> Array:
+        total = np.maximum(np.sum(residuals**2, axis=0), 1e-300)
+        taken = _RATIOS[:, None] * sizes / (1 + _RATIOS[:, None] * sizes)
+        left = np.maximum(total - taken @ (axes.T @ residuals) ** 2, 1e-12 * total)
+        penalty = np.sum(np.log1p(_RATIOS[:, None] * sizes), axis=1)[:, None]
+        return np.asarray(-0.5 * (self._freedom * np.log(left / total) + penalty))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded of some records, and functions of it."""
+
+    rows: FitRows
+    motion: Motion
+    inputs: tuple[Input, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, rows: FitRows, motion: Motion, dataset: Dataset) -> "Recorded":
+        return cls(rows, motion, tuple(_inputs(problem, motion, dataset)))
+
+    @property
+    def time(self) -> int:
+        """Which of the inputs."""
+        return next(i for i, own in enumerate(self.inputs) if own.kind == "time")
+
+    def functions(self, used: Sequence[int]) -> Functions:
+        """Of some inputs, each for itself."""
+        features = np.hstack([self._features(self.inputs[i]) for i in used])
+        along = [self._along(self.inputs[i]) for i in used if self.inputs[i].channel]
+        return Functions(np.hstack([*along, self._by_entry(features)]), features)
+
+    @cached_property
+    def of_time(self) -> tuple[Functions, ...]:
+        return (self.functions([self.time]),)
+
+    @cached_property
+    def of_pose(self) -> tuple[Functions, ...]:
+        """Of all inputs but time together, with pairs of joints and all joints; of near poses; of each input alone."""
+        joints = [own for own in self.inputs if own.kind == "joint"]
+        features = [self._features(own) for i, own in enumerate(self.inputs) if i != self.time]
+        for one, other in combinations(joints, 2):
+            if one.channel.partition(".")[0] == other.channel.partition(".")[0]:
+                first, second = (_harmonics(own.angle, 1)[0] for own in (one, other))
+                features.append(np.einsum("nk,nl->nkl", first, second).reshape(len(first), -1) / 2)
+        chords = np.sum([(2 * np.sin((j.angle[:, None] - j.angle) / 2)) ** 2 for j in joints], axis=0)
+        near, far = (np.exp(-chords / (2 * length**2)) for length in _POSE_LENGTHS)
+        whole = np.hstack([np.zeros((len(chords), 0)), *features])
+        smooth = self._of_kernel(whole @ whole.T + far)
+        together = replace(smooth, columns=np.hstack([self.of_joints.columns, smooth.columns]))
+        alone = [self.functions([i]) for i in range(len(self.inputs)) if i != self.time]
+        return (together, self._of_kernel(near), *alone)
+
+    def _of_kernel(self, kernel: Array) -> Functions:
+        """Functions of the records that correlate so (N x N), the smoothest ones."""
+        values, vectors = eigh(kernel)
+        most = max(1, _MOST_ENTRIES // self.rows.by_record.shape[1])
+        kept = np.flatnonzero(values > _SMALLEST * values[-1])[::-1][:most]
+        features = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+        return Functions(self._by_entry(features), features)
+
+    @cached_property
+    def of_joints(self) -> Functions:
+        """Of each joint's own angle and the side it came from, along its own motion."""
+        none = np.zeros((len(self.rows.residual), 0))
+        along = np.hstack([none, *(self._along(own) for own in self.inputs if own.channel)])
+        return Functions(along, np.zeros((len(self.rows.by_record), 0)))
+
+    def _features(self, own: Input) -> Array:
+        """Harmonics of one input (N x r): the variance of one falls as 1/order, as if any length were as likely."""
+        return _weighted(own.angle, self._highest(_FINE) if own.kind == "time" else _COARSE)
+
+    def _highest(self, most: int) -> int:
+        return min(most, max(_COARSE, len(self.rows.by_record) // _RECORDS_PER_HARMONIC))
+
+    def _along(self, own: Input) -> Array:
+        """Of one joint, along its own motion (rows x k)."""
+        of_all = np.mean([np.mean(self._moved(one) ** 2) for one in self.motion.channels])
+        most = min(_FINE, _MOST_ALONG // (2 * len(self.motion.channels))) if own.kind == "joint" else _COARSE
+        moved = self._moved(own.channel) / (np.sqrt(of_all) or 1.0)
+        features = _weighted(own.angle, self._highest(most))
+        columns = np.zeros((len(self.rows.residual), features.shape[1]))
+        columns[: len(moved)] = moved[:, None] * features[self.rows.record_of]
+        return columns
+
+    def _moved(self, channel: str) -> Array:
+        moved = self.rows.columns([slope[:, :, None] for slope in self.motion.along(channel)])
+        return np.asarray(moved[: len(self.rows.record_of), 0])
+
+    def _by_entry(self, features: Array) -> Array:
+        """Functions of each entry of a record's residual for itself; none of an entry that did not take part."""
+        by_record, size = self.rows.by_record, features.shape[1]
+        whitening = self.rows.whitening
+        acting = np.abs(self.rows.columns([np.ones((len(w), w.shape[2], 1)) for w in whitening])[:, 0]) > 0
+        columns = np.zeros((len(self.rows.residual), size * by_record.shape[1]))
+        for entry, own in enumerate(by_record.T):
+            columns[own, entry * size : (entry + 1) * size] = features * acting[own, None]
+        return columns
+
+
+def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Input]:
+    def on_circle(values: Array, closed: bool = False) -> Array:
+        low, high = np.nanmin(values), np.nanmax(values)
+        return np.nan_to_num(values if closed else np.pi * (values - low) / (high - low))
+
+    def varies(channel: str) -> bool:
+        return dataset.has(channel) and bool(np.nanmax(dataset.column(channel)) > np.nanmin(dataset.column(channel)))
+
+    arms, dimensions = problem.blueprint.arms, command_channels(problem.blueprint.arms)
+    for channel in motion.channels:
+        arm, _, joint = channel.partition(".")
+        shown, side = shown_joint(channel, arms), f"{arm}.approach.{joint}"
+        if varies(channel):
+            yield Input("joint", shown, channel, on_circle(dataset.column(channel), dimensions[channel] == "angle"))
+        if varies(side):
+            yield Input("approach", shown, channel, on_circle(dataset.column(side)))
+    order = recorded_order(dataset)
+    yield Input("time", "", "", on_circle(order) if np.ptp(order) > 0 else np.zeros(len(order)))
+    for kind in ("payload", "temperature"):
+        if varies(kind):
+            yield Input(kind, "", "", on_circle(dataset.column(kind)))
+
+
+def _harmonics(angle: Array, highest: int) -> tuple[Array, Array]:
+    """Cosines and sines of multiples of an angle (N x 2 highest), and which multiples."""
+    highest = max(1, min(highest, len(np.unique(np.round(angle, 9))) - 1))
+    order = np.arange(1, highest + 1)
+    turned = angle[:, None] * order
+    return np.hstack([np.cos(turned), np.sin(turned)]), np.tile(order, 2).astype(float)
+
+
+def _weighted(angle: Array, highest: int) -> Array:
+    harmonics, order = _harmonics(angle, highest)
+    return np.asarray(harmonics * np.sqrt(1 / (order * np.sum(1 / np.unique(order)))))

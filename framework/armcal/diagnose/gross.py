@@ -31,7 +31,7 @@ BEYOND, FAR_BEYOND, IMPLAUSIBLE = 4.0, 20.0, 100.0
 what is no length or angle: how many times a plausible size is worth a look."""
 _POSES = 60
 _FEWEST_LENGTHS = 3
-AS_MUCH, BY_SHARES = 0.01, 0.05
+AS_MUCH, BY_SHARES = 0.004, 0.05
 """Levels at which lengths are off in proportion: against each off by as much, and each by a share of its own."""
 
 
@@ -495,7 +495,7 @@ def weights(fit: Fit) -> list[Finding]:
     return worse_than_declared(fit.judged_mm, declared_mm, fit.unit)
 
 
-WORSE, POWER = 0.01, 0.9
+WORSE, POWER = 0.005, 0.9
 """Level of a loss against the nominal arm, and which share of losses of the size stated is found."""
 _VALUES_BY_DECLARED = "Leave out noise.estimate for the values, and use it to learn where the noise comes from."
 

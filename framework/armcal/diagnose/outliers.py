@@ -8,16 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import betainc, chdtri, fdtri, gammaincinv
+from scipy.special import betainc, chdtri
 
 from armcal.arm.assembly import shown_joint
 from armcal.base.arrays import Array, Indices
 from armcal.base.units import digits, display_unit, readable, to_unit
 from armcal.diagnose.checks import Finding, first_few
-from armcal.diagnose.fit import Fit, thinned
-from armcal.diagnose.fit_rows import FitRows, sampled_rows
-from armcal.estimate.estimator import Estimate
-from armcal.estimate.robust import WeighedFit
+from armcal.diagnose.coverage import whitened_like
+from armcal.diagnose.fit import Fit, FitRows, sampled_rows, thinned
+from armcal.estimate.polish import settled
+from armcal.estimate.robust import LEVEL, SMALLEST_SCALE, Distances, WeighedFit, studentised_distances
 from armcal.estimate.validation import error_dimension
 from armcal.estimate.variance import VarianceComponents
 from armcal.measure.groups import group_key
@@ -25,8 +25,6 @@ from armcal.problem.motion import Motion
 from armcal.problem.problem import Problem
 from armcal.problem.records import noise_roots
 
-BY_CHANCE = 0.01  # Of recordings in which noise alone puts any record beyond the limit, where none is configured
-_EFFICIENCY = 0.37  # Of a median as a measure of spread, against all numbers
 UNUSUAL = 0.95  # What is above this share of all records is unusual
 MOST_EXPLAINED = 50
 _ALIKE = 0.5
@@ -43,7 +41,7 @@ class Miss:
 
     record_id: str
     row: int
-    error_mm: float  # its error, by a fit that did not see it
+    error_mm: float  # its error, by a fit that did not see it where there is one
     reasons: tuple[str, ...]  # what is unusual about it, in words
     advice: str  # what to do about it
 
@@ -52,35 +50,19 @@ class Miss:
 class LargeErrors:
     """All records beyond the limit, the farthest first; at most ``MOST_EXPLAINED`` of them are explained."""
 
-    limit_mm: float  # the limit; the median one, where it grows with how uncertain a record's prediction is
-    configured: bool  # whether it is a setting; else it is ``noise_limit``
+    limit_mm: float  # the limit; the median one, where it is another for each record
+    configured: bool  # whether it is a setting for records that judge; else noise sets it, for all
     judged: int  # how many records were judged
     beyond: int  # how many lie beyond
     explained: tuple[Miss, ...]  # these, with reasons
-
-    def in_words(self, unit: str) -> str:
-        stated = f"{readable(self.limit_mm)} {unit}"
-        return f"above {stated}" if self.configured else f"beyond what noise explains ({stated} for most records)"
-
-
-def noise_limit(errors: Array, rows: float) -> float:
-    """Beyond what equal normal noise seldom (``BY_CHANCE``) puts any of these errors, each of so many numbers.
-
-    Its size is known from their median; a range is seldom off by so little as a position is, so its medians count more.
-    """
-    numbers = len(errors) * rows
-    medians = fdtri(rows, _EFFICIENCY * numbers, 1 - BY_CHANCE / len(errors)) * rows / (2 * gammaincinv(rows / 2, 0.5))
-    return float(np.sqrt(medians) * np.median(errors))
 
 
 def noise_of(fit: Fit) -> tuple[Array, float]:
     """How far noise, as records state it, puts each off (N; SI), and of how many independent numbers that is.
 
     Noise of joints is larger the farther out the arm reaches, and moves it along some directions more than along
-    others. More than three numbers, as of an image, are off together. Of a fit that did not converge all are alike.
+    others. More than three numbers, as of an image, are off together.
     """
-    if not fit.converged:
-        return np.ones(len(fit.dataset)), 3.0
     problem = fit.few
     counted, count = error_dimension(problem), problem.count
     total, squares = np.zeros((2, count))
@@ -95,35 +77,56 @@ def noise_of(fit: Fit) -> tuple[Array, float]:
     return np.sqrt(np.where(known, total, 1.0)), float(np.clip(np.median(rows_known), 1, 3)) if known.any() else 3.0
 
 
+def distances(fit: Fit) -> Distances:
+    """How far each record of the dataset lies from the fit, in its own standard deviations; also those held out."""
+    problem, values = whitened_like(fit.few, fit.fitted, fit.estimator), settled(fit.problem, fit.estimate.values)
+    weights = [np.zeros(problem.count) for _ in problem.records]
+    for every, own in zip(weights, fit.fitted.weights, strict=True):
+        every[fit.split.train] = own
+    return studentised_distances(problem, values, weights)
+
+
 def large_errors(fit: Fit) -> LargeErrors | None:
-    """Which judged records lie beyond the limit, and what is unusual about them; None if none was judged."""
+    """Which records lie beyond the limit, and what is unusual about them; None if none was judged.
+
+    Under a loss, what it made of the training records is in ``suspect_findings``.
+    """
     if not fit.converged:
         return None
-    problem, estimate, motion = fit.few, fit.estimate, fit.motion
-    errors, limit_mm = fit.judged_mm, fit.ready.limit_mm
+    stated, errors = fit.ready.limit_mm, fit.judged_mm
+    far = fit.of(distances)
+    if stated is not None:
+        limits = np.full(len(errors), stated)
+    else:
+        beyond = np.max(far.beyond(), axis=0)
+        errors = np.where(np.isfinite(errors), errors, fit.errors.calibrated_mm)
+        if fit.fitted.loss != "none":
+            errors[fit.split.train] = np.nan
+        limits = errors / np.maximum(beyond, SMALLEST_SCALE)
     known = np.isfinite(errors)
     if not known.any():
         return None
-    variance = _leverage(problem, estimate)
-    if limit_mm is None:
-        noise, numbers = fit.of(noise_of)
-        sizes = noise * np.sqrt(1 + variance / sum(len(kernel.factor.noise) for kernel in problem.kernels))
-        limits = sizes * noise_limit(errors[known] / sizes[known], numbers)
-    else:
-        limits = np.full(len(errors), limit_mm)
-    beyond = np.flatnonzero(known & (errors > limits))
-    beyond = beyond[np.argsort(-errors[beyond], kind="stable")]
+    missed = np.flatnonzero(known & (errors > limits))
+    missed = missed[np.argsort(-(errors / limits)[missed], kind="stable")]
     explained: tuple[Miss, ...] = ()
-    if len(beyond):
-        leverage = _above(variance)
-        efforts = {name: _above(np.abs(loads.efforts)) for name, loads in motion.loads.items()}
-        residuals = problem.residuals(estimate.values)
-        explained = tuple(_miss(fit, int(i), residuals, leverage, efforts) for i in beyond[:MOST_EXPLAINED])
+    if len(missed):
+        leverage = _above(np.sum(far.leverages, axis=0))
+        efforts = {name: _above(np.abs(loads.efforts)) for name, loads in fit.motion.loads.items()}
+        residuals = fit.few.residuals(fit.estimate.values)
+        farthest = missed[:MOST_EXPLAINED]
+        explained = tuple(_miss(fit, int(i), float(errors[i]), residuals, leverage, efforts) for i in farthest)
     limit = float(np.median(limits[known]))
-    return LargeErrors(limit, limit_mm is not None, int(known.sum()), len(beyond), explained)
+    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), explained)
 
 
-def _miss(fit: Fit, record: int, residuals: Sequence[Array], leverage: Array, efforts: Mapping[str, Array]) -> Miss:
+def _miss(
+    fit: Fit,
+    record: int,
+    error_mm: float,
+    residuals: Sequence[Array],
+    leverage: Array,
+    efforts: Mapping[str, Array],
+) -> Miss:
     """``residuals`` are raw, of each factor (n_r x N), in one sign convention."""
     problem, dataset, motion = fit.problem, fit.dataset, fit.motion
     whole, step = np.vstack(residuals), fit.position - fit.position[record]
@@ -145,20 +148,7 @@ def _miss(fit: Fit, record: int, residuals: Sequence[Array], leverage: Array, ef
         advice = "measure more poses like it"
     unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
     row = dataset.rows[record] if dataset.rows else 0
-    return Miss(dataset.ids[record], row, float(fit.judged_mm[record]), unusual, advice)
-
-
-def _leverage(problem: Problem, estimate: Estimate) -> Array:
-    """Variance of what the model predicts of each record, in units of the declared noise (N)."""
-    count = problem.count
-    if not len(estimate.covariance):
-        return np.zeros(count)
-    values, vectors = np.linalg.eigh(estimate.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    total = np.zeros(count)
-    for jacobian in problem.jacobians(estimate.values):
-        total += np.sum((np.swapaxes(jacobian, 1, 2) @ root) ** 2, axis=(0, 2))
-    return total
+    return Miss(dataset.ids[record], row, error_mm, unusual, advice)
 
 
 def _above(numbers: Array) -> Array:
@@ -201,9 +191,8 @@ def _along(record: int, problem: Problem, motion: Motion, residuals: Sequence[Ar
 
 
 MOST_LISTED = 10
-MOST_SUSPICIOUS = 0.2  # Of the training records; more of them are no outliers
-_SMALLEST = 1e-3  # Of the noise, in thousandths: smaller errors are a simulation's without noise
-_MOST_NAMED, _FEW_NAMED, MOST_TOLD = 5, 3, 5
+MOST_SUSPICIOUS = 0.2  # Of the records; more of them are no outliers
+_FEW_NAMED, MOST_TOLD = 3, 5
 _TOO_MANY = "their noise is larger than the others', or the model lacks something where they are"
 _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
 
@@ -226,33 +215,6 @@ def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
         )
         findings.append(Finding("warning", text))
     return findings
-
-
-def suspicious_records(errors: Array, rows: float, ids: Sequence[str], fitted: WeighedFit | None) -> list[str]:
-    """Ids of training records beyond their limit, the farthest first.
-
-    ``errors`` are in units of each record's noise, of so many numbers each.
-    """
-    if fitted is not None and fitted.loss != "none":
-        return list(dict.fromkeys(ids[suspect.record] for suspect in fitted.suspects))
-    beyond = np.flatnonzero(errors > max(noise_limit(errors, rows), _SMALLEST))
-    return [ids[i] for i in beyond[np.argsort(-errors[beyond], kind="stable")]]
-
-
-def outlier_findings(suspicious: Sequence[str], ids: Sequence[str], fitted: WeighedFit | None) -> list[Finding]:
-    if fitted is not None and fitted.loss != "none":
-        action = "Look at them in residuals.csv, and measure them again."
-        return [replace(f, action=action) if f.grade == "warning" else f for f in suspect_findings(fitted, ids)]
-    if not suspicious:
-        return []
-    listed = ", ".join(suspicious[:_MOST_NAMED])
-    count = "1 training record lies" if len(suspicious) == 1 else f"{len(suspicious)} training records lie"
-    text = f"{count} farther from the fit than noise allows, the worst {listed}."
-    test = f"noise of their median size, {100 * BY_CHANCE:g} % over all"
-    if len(suspicious) > MOST_SUSPICIOUS * len(ids):
-        action = "Look in residuals.csv at what they have in common, and state their noise if it is known."
-        return [Finding("warning", f"{text} So many are no outliers: {_TOO_MANY}.", test, action)]
-    return [Finding("warning", text, test, "Measure them again, or set noise.loss: reject; residuals.csv has all.")]
 
 
 def component_findings(components: VarianceComponents) -> list[Finding]:
@@ -284,38 +246,38 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
     return findings
 
 
-def suspicious_ids(fit: Fit) -> list[str]:
-    """Of training records beyond their limit, the farthest first."""
-    sizes, numbers = fit.of(noise_of)
-    train = fit.split.train
-    return suspicious_records(fit.errors.calibrated_mm[train] / sizes[train], numbers, fit.trained_on, fit.fitted)
-
-
-def suspicious(fit: Fit) -> list[Finding]:
-    return outlier_findings(fit.of(suspicious_ids), fit.trained_on, fit.fitted)
-
-
-def missed(fit: Fit) -> list[Finding]:
+def outlying(fit: Fit) -> list[Finding]:
+    """Records farther from the fit than noise allows, or than ``validation.limit_mm`` where it is stated."""
+    findings = []
+    if fit.fitted.loss != "none":
+        action = "Look at them in residuals.csv, and measure them again."
+        by_loss = suspect_findings(fit.fitted, fit.trained_on)
+        findings = [replace(one, action=action) if one.grade == "warning" else one for one in by_loss]
     beyond, unit = fit.of(large_errors), fit.unit
     if beyond is None:
-        return []
-    limit = (
-        "validation.limit_mm"
-        if beyond.configured
-        else f"what noise and uncertain parameters do, {100 * BY_CHANCE:g} % over all"
-    )
-    test = f"errors of {beyond.judged} records by fits that did not see them, limit {limit}"
+        return findings
+    limit, test = f"above {readable(beyond.limit_mm)} {unit}", f"{beyond.judged} records"
+    if beyond.configured:
+        what, test = f"an error {limit}", f"{test} by fits that did not see them, limit validation.limit_mm"
+    else:
+        what = f"an error beyond what noise explains ({limit} for most records)"
+        test += f", each by its noise and the parameters' uncertainty, {100 * LEVEL:g} % over all"
     if not beyond.beyond:
-        return [Finding("good", f"No judged record has an error {beyond.in_words(unit)}.", test)]
-    listed = "; ".join(
-        f"{miss.record_id} ({readable(miss.error_mm)} {unit}: {', '.join(miss.reasons)})"
-        for miss in beyond.explained[:MOST_TOLD]
-    )
+        return [*findings, Finding("good", f"No judged record has {what}.", test)]
+    first = beyond.explained[:MOST_TOLD]
+    count = "1 record has" if beyond.beyond == 1 else f"{beyond.beyond} records have"
+    if not beyond.configured and beyond.beyond > MOST_SUSPICIOUS * beyond.judged:
+        listed = ", ".join(miss.record_id for miss in first)
+        text = f"{count} {what}, the worst {listed}. So many are no outliers: {_TOO_MANY}."
+        action = "Look in residuals.csv at what they have in common, and state their noise if it is known."
+        return [*findings, Finding("warning", text, test, action)]
+    listed = "; ".join(f"{m.record_id} ({readable(m.error_mm)} {unit}: {', '.join(m.reasons)})" for m in first)
     more = f"; and {beyond.beyond - MOST_TOLD} more, in the report" if beyond.beyond > MOST_TOLD else ""
-    records = "1 record has" if beyond.beyond == 1 else f"{beyond.beyond} records have"
-    text = f"{records} an error {beyond.in_words(unit)}: "
-    advice = "; or ".join(dict.fromkeys(miss.advice for miss in beyond.explained[:MOST_TOLD]))
-    return [Finding("warning", f"{text}{listed}{more}.", test, f"{advice.capitalize()}.")]
+    advice = "; or ".join(dict.fromkeys(miss.advice for miss in first))
+    advice = f"{advice.capitalize()}."
+    if {miss.record_id for miss in first} & set(fit.trained_on):
+        advice += " Or set noise.loss: reject, which sets such records aside."
+    return [*findings, Finding("warning", f"{count} {what}: {listed}{more}.", test, advice)]
 
 
 LEAST_SHARE = 0.1  # Of the records: fewer than these are outliers, which the other tests name one by one

@@ -21,12 +21,21 @@ from scipy.special import chdtrc, chdtri, fdtrc
 
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.units import SMALLEST_SHOWN, digits, readable
-from armcal.diagnose.causes import Cause, Records, causes_of, predicted_positions, scatter_features
+from armcal.diagnose.causes import (
+    WILD,
+    Cause,
+    Functions,
+    Recorded,
+    Records,
+    Smooth,
+    causes_of,
+    moves_of,
+    predicted_positions,
+    scatter_features,
+    with_contradicted,
+)
 from armcal.diagnose.checks import Finding
-from armcal.diagnose.fit import Fit
-from armcal.diagnose.fit_rows import SMALLEST, FitRows, basis_of, lag_one, own_basis
-from armcal.diagnose.held import moves_of, with_contradicted
-from armcal.diagnose.smooth import WILD, Functions, Recorded, Smooth
+from armcal.diagnose.fit import SMALLEST, Fit, FitRows, basis_of, lag_one, own_basis
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure, candidates
 from armcal.estimate.uncertainty import automatic_block_length
@@ -58,7 +67,7 @@ _NEGLIGIBLE = 0.1  # Of what causes take up: less than this may be what is not l
 _NEXT_CARRIER = 0.1  # Of the whole share: what predicts less beside the ones before it is not named
 _BEYOND = 0.05  # Level at which what a cause leaves is more than noise
 _LIKELIER = 0.5  # Where chance has more of the odds, a cause is none
-_LACK, _TIMES_REPEATS, _FEWEST_REPEATS = 0.01, 3.0, 5
+_LACK, _TIMES_REPEATS, _FEWEST_REPEATS = 0.005, 3.0, 5
 _LEAST_LEFT = 0.05  # Of a row, of what a fit takes up most
 _MM = 1000.0
 

@@ -22,12 +22,10 @@ from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, display_unit, from_unit, readable, si_unit, to_unit, unit
-from armcal.diagnose.causes import predicted_positions
+from armcal.diagnose.causes import OFF, held_scales, predicted_positions
 from armcal.diagnose.checks import Finding, first_few
-from armcal.diagnose.fit import Fit, thinned
-from armcal.diagnose.fit_rows import FitRows, sampled_rows
+from armcal.diagnose.fit import Fit, FitRows, sampled_rows, thinned
 from armcal.diagnose.gross import Figure, figure
-from armcal.diagnose.held import OFF, held_scales
 from armcal.diagnose.residual_structure import CLEAR, structure
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import OF_PRIOR, determined_in_words

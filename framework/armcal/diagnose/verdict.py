@@ -12,12 +12,12 @@ from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock
 from armcal.base.units import digits, readable
+from armcal.diagnose.causes import contradictions
 from armcal.diagnose.checks import FIT_CHECKS, Finding, first_few, plugin_checks
 from armcal.diagnose.coverage import predictions
 from armcal.diagnose.data import still_joints
 from armcal.diagnose.fit import Fit
 from armcal.diagnose.gross import by_halves
-from armcal.diagnose.held import contradictions
 from armcal.diagnose.outliers import MOST_TOLD, component_findings, large_errors
 from armcal.diagnose.residual_structure import structure
 from armcal.diagnose.unseen import Elsewhere, elsewhere, hidden_payload, priors_alone, rounding

@@ -242,18 +242,27 @@ def settled(problem: Problem, values: Array) -> Array:
     Args:
         problem: as it was fitted; the groups it holds although they were compiled as free are those not seen.
         values: of the fit.
-        records: that judge; with weights of zero where they are not to count.
+    """
+    unseen = of_unseen_groups(problem, values)
+    if unseen is None:
+        return values
+    posed = PosedProblem(unseen)
+    return posed.values(descended(posed, np.zeros(len(posed.scales)), _MOST_STEPS, _DAMPING))
+
+
+def of_unseen_groups(problem: Problem, values: Array) -> Problem | None:
+    """The problem about these values in which only groups are free that a fit did not see; None where there are none.
+
+    Records with weights of zero do not count.
     """
     fitted = {block.name for block in problem.parameters.free}
     open_names = {block.name for block in problem.blueprint.parameters.free if block.nuisance} - fitted
     names = open_names & _present(problem)
     if not names:
-        return values
+        return None
     parameters = problem.parameters.with_nominal(values)
     without_priors = {block.name: replace(block, prior_sd=None) for block in parameters.nuisances}
-    inner = parameters.replaced(without_priors).with_free(names)
-    posed = PosedProblem(problem.with_parameters(inner, tied=False))
-    return posed.values(descended(posed, np.zeros(len(posed.scales)), _MOST_STEPS, _DAMPING))
+    return problem.with_parameters(parameters.replaced(without_priors).with_free(names), tied=False)
 
 
 def _present(problem: Problem) -> set[str]:

@@ -45,7 +45,7 @@ from armcal.estimate.estimator import (
     spread,
 )
 from armcal.estimate.identifiability import InverseInformation
-from armcal.estimate.polish import bounded_step
+from armcal.estimate.polish import bounded_step, of_unseen_groups
 from armcal.estimate.variance import Axes, VarianceComponents, apply_components, estimate_components
 from armcal.io.parallel import Executor
 from armcal.problem.problem import PosedProblem, Problem
@@ -116,6 +116,8 @@ def median_norm(dimension: int) -> float:
 
 
 LEVEL = 0.01  # Of calling any record an outlier though all noise is Gaussian
+EFFICIENCY_OF_MEDIAN = 0.37  # As a measure of spread, against all numbers
+INDEPENDENT = 3  # More numbers of a record, as of an image, are off together
 SMALLEST_SCALE = 1e-3
 """In units of the declared noise: residuals smaller than this are none, and no measure of what is large."""
 UNCONTROLLED = 1e-3  # Of a residual's variance: below this it would hardly show an error of its own record
@@ -128,11 +130,13 @@ class Distances:
     Attributes:
         studentised: length of each residual in its own standard deviations (N each); 0 where nothing controls it.
         scales: residuals in units of their noise, by their median, so that a minority of outliers hardly matters.
+        leverages: variance of what the fit predicts of each record, in units of its noise (N each).
     """
 
     studentised: tuple[Array, ...]
     limits: tuple[float, ...]  # the length that the largest of all stays below in 99 % of experiments without outliers
     scales: tuple[float, ...]
+    leverages: tuple[Array, ...]
 
     def beyond(self) -> tuple[Array, ...]:
         """How many limits away each record lies (N each)."""
@@ -142,29 +146,61 @@ class Distances:
 def studentised_distances(problem: Problem, values: Array, weights: Sequence[Array]) -> Distances:
     """Distances of all records from a fit that gave them these weights (N each, 0 to 1).
 
-    The limit is Fisher's quantile at 1 % over the number of records (Bonferroni).
+    Groups that the fit did not see are taken for fitted to their own records, as ``settled`` does.
+    The limit is Fisher's quantile at 1 % over the number of records (Bonferroni), with as many degrees of freedom as
+    the median, which scales the residuals, is worth.
     """
     counted = problem.weighted(weights)
     inverse = InverseInformation.of(counted.triangular_factor(values), problem.parameters)
     residuals = remaining(problem, values, weights)
     directions = problem.parameters.entries_jacobian(values) @ inverse.root
-    lengths = []
-    for residual, jacobian, weight in zip(residuals, problem.jacobians(values), weights, strict=True):
-        reached = np.einsum("avn,vk->akn", jacobian, directions)
-        hat = np.einsum("avn,bvn->nab", reached, reached)
-        sizes, axes = np.linalg.eigh(np.eye(len(reached)) - (2 * weight[:, None, None] - 1) * hat)
+    lengths, leverages = list[Array](), list[Array]()
+    groups = _unseen_directions(problem, values)
+    for residual, jacobian, weight, own in zip(residuals, problem.jacobians(values), weights, groups, strict=True):
+        rows, count = residual.shape
+        reached = np.einsum("avn,vk->nak", jacobian, directions)
+        reached -= (own @ (own.T @ reached.reshape(rows * count, -1))).reshape(reached.shape)
+        hat, taken = (np.einsum("nak,nbk->nab", x, x) for x in (reached, own.reshape(count, rows, -1)))
+        sizes, axes = np.linalg.eigh(np.eye(rows) - taken - (2 * weight[:, None, None] - 1) * hat)
         # sqrt(r' S^-1 r) of each record; directions that nothing controls are left out.
         along, controlled = np.einsum("nab,an->nb", axes, residual), sizes > UNCONTROLLED
         squares = np.where(controlled, along**2 / np.where(controlled, sizes, 1.0), 0.0)
         lengths.append(np.sqrt(np.sum(squares, axis=1)))
-    freedom = max(1.0, counted.equations() - inverse.spent)
-    tests = sum(len(length) for length in lengths)
-    rows = [len(residual) for residual in residuals]
-    typical = [float(np.median(length)) / median_norm(m) for length, m in zip(lengths, rows, strict=True)]
-    scales = [max(scale, SMALLEST_SCALE) for scale in typical]
-    limits = [float(np.sqrt(m * fdtri(m, freedom, 1 - LEVEL / max(1, tests)))) for m in rows]
+        leverages.append(np.trace(hat, axis1=1, axis2=2))
+    freedom = counted.equations() - inverse.spent
+    made = [record.measured for record in problem.records]
+    scales, limits = list[float](), list[float]()
+    for kernel, length, known in zip(problem.kernels, lengths, made, strict=True):
+        rows = kernel.factor.rows
+        typical = float(np.median(length[known])) / median_norm(rows) if known.any() else 1.0
+        scales.append(max(typical, SMALLEST_SCALE))
+        limits.append(limit_of(rows, freedom, int(np.sum(made))))
     studentised = [length / scale for length, scale in zip(lengths, scales, strict=True)]
-    return Distances(tuple(studentised), tuple(limits), tuple(scales))
+    return Distances(tuple(studentised), tuple(limits), tuple(scales), tuple(leverages))
+
+
+def limit_of(rows: int, freedom: float, tests: int) -> float:
+    """What the longest of so many residuals, of ``rows`` numbers each, stays below in 99 % of experiments.
+
+    They are scaled by their median, and have ``freedom`` numbers left beside what the fit took up.
+    """
+    squares = fdtri(min(rows, INDEPENDENT), max(1.0, EFFICIENCY_OF_MEDIAN * freedom), 1 - LEVEL / max(1, tests))
+    return float(np.sqrt(rows * squares))
+
+
+def _unseen_directions(problem: Problem, values: Array) -> list[Array]:
+    """Of each factor an orthonormal basis of what groups that a fit did not see take up (N n_r x k)."""
+    unseen = of_unseen_groups(problem, values)
+    if unseen is None:
+        return [
+            np.zeros((record.count * kernel.factor.rows, 0))
+            for kernel, record in zip(problem.kernels, problem.records, strict=True)
+        ]
+    chain, bases = unseen.parameters.entries_jacobian(values), []
+    for jacobian in unseen.jacobians(values):
+        columns = np.einsum("avn,vk->nak", jacobian, chain).reshape(-1, chain.shape[1])
+        bases.append(np.linalg.qr(columns[:, np.any(columns, axis=0)])[0])
+    return bases
 
 
 def remaining(problem: Problem, values: Array, weights: Sequence[Array]) -> tuple[Array, ...]:

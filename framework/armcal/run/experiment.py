@@ -1,30 +1,49 @@
-"""An experiment: a configuration, checked and built, before any data is read."""
+"""An experiment: a configuration with its settings, checked and built, before any data is read.
+
+Settings go beyond what the arm is: data, parameters, estimator, validation, simulation, pose plan and its clearance.
+"""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import filter as matching
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
+from pydantic import Field, field_validator, model_validator
 
-from armcal.arm.assembly import command_channels
+from armcal.arm.assembly import Arm, command_channels, only_arm
+from armcal.arm.clearance import (
+    EVERYTHING,
+    Box,
+    Capsule,
+    Clearance,
+    ClearanceCheck,
+    HalfSpace,
+    Point,
+    Rule,
+    Shape,
+    joints_of_frames,
+)
 from armcal.base.arrays import Array, Indices
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
+from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.calibration.calibration_file import identity_of
 from armcal.calibration.recorded_range import PAYLOAD
-from armcal.config.selection import select, without_groups
-from armcal.config.system import System, build_component, build_system
+from armcal.config.selection import ParameterSettings, select, without_groups
+from armcal.config.system import StaticsSettings, System, build_component, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Estimator, Progress, no_progress
-from armcal.estimate.robust import weighed
+from armcal.estimate.robust import NoiseSettings, weighed
 from armcal.estimate.simulation import SimulationRequest, Simulator
+from armcal.estimate.uncertainty import BootstrapSettings
 from armcal.estimate.validation import Split, folds, hold_out, split_by_id, split_by_label
 from armcal.measure.checks import records_of
 from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
@@ -32,7 +51,197 @@ from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, un
 from armcal.measure.measurement import GroupedMeasurement
 from armcal.measure.reader import Reader, ReadRequest, evidence_channels, read_ids, requested_channels
 from armcal.plugins import PluginRegistry, discover
-from armcal.run.settings import ExperimentSettings
+
+_AT = ("plan", "clearance")
+
+
+class CapsuleSettings(Settings):
+    """All that lies within ``radius`` of the segment from ``start`` to ``end``."""
+
+    type: Literal["capsule"]
+    start: Point
+    end: Point
+    radius: Length
+
+
+class BallSettings(Settings):
+    """A ball."""
+
+    type: Literal["ball"]
+    centre: Point
+    radius: Length
+
+
+ShapeSettings: TypeAlias = Annotated[CapsuleSettings | BallSettings | Box | HalfSpace, Field(discriminator="type")]
+
+
+class ClearanceSettings(Settings):
+    """The arm's parts and its surroundings by name, and how far they keep from each other.
+
+    ``forbidden`` are boxes and balls that the tool point stays out of.
+    """
+
+    parts: dict[str, tuple[ShapeSettings, ...]] = Field(default_factory=dict)
+    rules: tuple[Rule, ...] = ()
+    forbidden: tuple[Annotated[Box | BallSettings, Field(discriminator="type")], ...] = ()
+
+
+def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source: ConfigSource) -> ClearanceCheck:
+    """The check that the settings describe.
+
+    Raises:
+        ConfigError: a frame or part is not known, or a rule is about no pair.
+    """
+    arm = only_arm(arms, "clearance is checked for a single arm", "Leave the clearance out.", source.where(_AT))
+    frames = joints_of_frames(arm)
+    parts = {
+        name: tuple(_shape(shape, frames, source, ("parts", name, index)) for index, shape in enumerate(shapes))
+        for name, shapes in settings.parts.items()
+    }
+    for index, region in enumerate(settings.forbidden):
+        if isinstance(region, BallSettings) and region.centre.frame != "base":
+            raise ConfigError(
+                f"found the frame {region.centre.frame!r}, expected base: forbidden regions stand still.",
+                where=source.where((*_AT, "forbidden", index, "centre")),
+                hint="Give the centre in the base frame.",
+            )
+    forbidden = tuple(region if isinstance(region, Box) else _ball(region) for region in settings.forbidden)
+    check = ClearanceCheck(arm, Clearance(parts, settings.rules, forbidden))
+    for index, (rule, pairs) in enumerate(zip(settings.rules, check.pairs, strict=True)):
+        where, globs = source.where((*_AT, "rules", index)), (*rule.between, *rule.besides)
+        if unknown := [glob for glob in globs if glob != EVERYTHING and not matching(parts, glob)]:
+            hint = f"The parts are {', '.join(parts) or 'none'}."
+            raise ConfigError(f"no part is called {unknown[0]!r}.", where=where, hint=hint)
+        if not pairs:
+            raise ConfigError(
+                f"the rule between {' and '.join(rule.between)} matches no pair of parts.",
+                where=where,
+                hint="Parts with at most one joint between them do not count; name others, or remove the rule.",
+            )
+    return check
+
+
+def _shape(
+    settings: ShapeSettings, frames: Mapping[str, int], source: ConfigSource, at: tuple[str | int, ...]
+) -> Shape:
+    """A part's shape, whose frames are known and whose radius is no less than zero."""
+    shape: Shape
+    if isinstance(settings, CapsuleSettings):
+        shape = Capsule(settings.start, settings.end, settings.radius)
+    else:
+        shape = _ball(settings) if isinstance(settings, BallSettings) else settings
+    where = source.where((*_AT, *at))
+    for frame in shape.frames:
+        if frame not in frames:
+            raise ConfigError(
+                f"no frame is called {frame!r}.", where=where, hint=f"The frames are {', '.join(frames)}."
+            )
+    if isinstance(shape, Capsule) and not shape.radius >= 0:
+        raise ConfigError("found a radius below zero.", where=where, hint="Give the radius.")
+    return shape
+
+
+def _ball(settings: BallSettings) -> Capsule:
+    return Capsule(settings.centre, settings.centre, settings.radius)
+
+
+Levels: TypeAlias = dict[str, Annotated[tuple[Angle, ...], Field(min_length=1)]]
+Travel: TypeAlias = dict[str, Annotated[tuple[Length, ...], Field(min_length=1)]]
+Speed: TypeAlias = Annotated[float, Field(gt=0)]
+
+
+class ValidationSettings(Settings):
+    """Which records judge.
+
+    ``holdout`` is a fraction chosen by ``seed``; ``train_ids`` a CSV of record ids to train on (the rest judge);
+    ``train_groups`` are the values of the text column ``group_by`` to train on (by default the first label of a
+    measurement's groups); ``folds`` cross-validates over the training records. Judged records whose error is above
+    ``limit`` are listed and explained; without one, those beyond what noise allows.
+    """
+
+    holdout: float = 0.0
+    folds: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0)] = 0
+    train_ids: InputPath | None = None
+    train_groups: tuple[str, ...] | None = None
+    group_by: str | None = None
+    limit: Length | None = None
+
+    @field_validator("holdout")
+    @classmethod
+    def _share(cls, value: float) -> float:
+        if not 0 <= value < 1:
+            raise ValueError(f"found {value:g}, expected a share from 0 to below 1: write 0.25 for a quarter")
+        return value
+
+    @model_validator(mode="after")
+    def _one_split(self) -> Self:
+        given = {"holdout": self.holdout > 0, "train_ids": self.train_ids, "train_groups": self.train_groups}
+        several = [name for name, value in given.items() if value]
+        if len(several) > 1:
+            raise ValueError(f"found both {several[0]} and {several[1]}, expected one of them: set holdout: 0")
+        if self.folds == 1:
+            raise ValueError("found folds: 1, expected 0 (none) or at least 2")
+        if self.limit is not None and self.limit <= 0:
+            raise ValueError(f"found a limit of {1000 * self.limit:g} mm, expected one above zero")
+        return self
+
+
+class UncertaintySettings(BootstrapSettings):
+    """How intervals are made beside the curvature at the estimate; ``profile`` are globs over free numbers."""
+
+    profile: tuple[str, ...] = ()
+
+
+class PlanSettings(Settings):
+    """How poses are planned.
+
+    ``candidates``: ``recorded`` (the data's), ``grid`` (all combinations of ``levels``), or ``continuous``
+    (``count`` poses spread over ``limits``, and the chosen ones moved from there to where they determine most). Sliding
+    joints have their levels under ``travel`` and their limits under ``travel_limits``. Any candidate outside the
+    limits is left out. ``speeds_deg_per_s`` and ``speeds_mm_per_s`` are by joint; 60 deg/s and 50 mm/s by default.
+    """
+
+    candidates: Literal["recorded", "grid", "continuous"] | None = None
+    count: Annotated[int, Field(ge=1, le=1_000_000)] = 4096
+    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    travel_limits: dict[str, tuple[Length, Length]] = Field(default_factory=dict)
+    levels: Levels = Field(default_factory=dict)
+    travel: Travel = Field(default_factory=dict)
+    starts: Annotated[int, Field(ge=0)] = 10
+    seed: Annotated[int, Field(ge=0)] = 0
+    sweeps: Annotated[int, Field(ge=0, le=100)] = 8
+    clearance: ClearanceSettings | None = None
+    order: Literal["travel", "none"] = "travel"
+    speeds_deg_per_s: dict[str, Speed] = Field(default_factory=dict)
+    speeds_mm_per_s: dict[str, Speed] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for joint, (low, high) in {**self.limits, **self.travel_limits}.items():
+            if not low < high:
+                raise ValueError(f"the limits of {joint} are not in rising order: give [lowest, highest]")
+        return self
+
+
+class ExperimentSettings(Settings):
+    """A whole configuration; components keep their own settings under ``type``."""
+
+    name: str = ""
+    arms: dict[str, Any]
+    measurements: dict[str, Any]
+    statics: StaticsSettings = Field(default_factory=StaticsSettings)
+    data: dict[str, Any] | None = None
+    simulation: dict[str, Any] | None = None
+    parameters: ParameterSettings = Field(default_factory=ParameterSettings)
+    estimator: dict[str, Any] = Field(default_factory=lambda: {"type": "ipopt"})
+    evaluator: Literal["auto", "compiled", "interpreted"] = "auto"
+    validation: ValidationSettings = Field(default_factory=ValidationSettings)
+    noise: NoiseSettings = Field(default_factory=NoiseSettings)
+    uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
+    plan: PlanSettings | None = None
+    bench: dict[str, Any] | None = None
+
 
 STANDARD_GRAVITY = {"earth": 9.80665, "moon": 1.62, "mars": 3.71}  # m/s^2; [Williams2024]
 _HEAVY = 20.0

@@ -18,10 +18,9 @@ from armcal.calibration.compensation.compensator import Compensator
 from armcal.calibration.compensation.request import Options
 from armcal.calibration.tool_expression import arm_expression
 from armcal.errors import ProblemError
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, PlanSettings
 from armcal.run.plan import approach_channels, values_about
 from armcal.run.plan_poses import JointSpace, clearance_of, spread
-from armcal.run.settings import PlanSettings
 
 NAMES = ("P1", "P2", "P3", "P4", "P5")
 """P1 is the centre, P2 to P5 go round the plane; P2 and P4 are ends of one diagonal."""

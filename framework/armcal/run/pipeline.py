@@ -17,8 +17,7 @@ from armcal.calibration.intervals import PredictionRecord, covariance_rows, reco
 from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
 from armcal.diagnose.checks import DATA_CHECKS, first_few, plugin_checks
 from armcal.diagnose.coverage import fit_and_predict, intervals
-from armcal.diagnose.fit import Fit, Prepared
-from armcal.diagnose.fit_rows import widened
+from armcal.diagnose.fit import Fit, Prepared, widened
 from armcal.diagnose.verdict import verdict_of
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress, spread

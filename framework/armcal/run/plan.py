@@ -35,7 +35,7 @@ from armcal.planning.candidates import (
 from armcal.planning.exchange import Allowed, Plan, choose, refine
 from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem, triangular
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, PlanSettings
 from armcal.run.plan_poses import (
     JointSpace,
     Pool,
@@ -46,7 +46,6 @@ from armcal.run.plan_poses import (
     read_poses,
     same_poses,
 )
-from armcal.run.settings import PlanSettings
 
 _SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}  # rad/s, m/s
 _MOST_PASSES = 50  # of an order of visit that is improved

@@ -21,9 +21,7 @@ from armcal.measure.checks import records_of
 from armcal.measure.environment import TOLERANCE, own_limits, span_text
 from armcal.measure.reader import Reader
 from armcal.plugins import PluginRegistry
-from armcal.run.experiment import Experiment, with_data
-from armcal.run.plan_clearance import clearance_check
-from armcal.run.settings import PlanSettings
+from armcal.run.experiment import Experiment, PlanSettings, clearance_check, with_data
 
 _OF_THE_MOMENT = ("time", "temperature")
 _MOST_GRID = 2_000_000

@@ -42,10 +42,9 @@ from armcal.io.cells import csv_text
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, ExperimentSettings, ValidationSettings
 from armcal.run.pipeline import Stopwatch, prepare
 from armcal.run.pose_residual import Layer, judged_with, layer_of
-from armcal.run.settings import ExperimentSettings, ValidationSettings
 
 R = TypeVar("R")
 PREVIOUS = "previous"  # As a reference: each variant is compared with the one before it

@@ -13,9 +13,8 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice, standing_at
 from armcal.errors import ConfigError, DataError, Location
-from armcal.run.experiment import Experiment
+from armcal.run.experiment import Experiment, clearance_check
 from armcal.run.plan import approach_channels
-from armcal.run.plan_clearance import clearance_check
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
 from armcal_bench.acquisition.drive import PathPlanner

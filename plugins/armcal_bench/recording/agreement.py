@@ -20,7 +20,7 @@ from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import to_unit
 from armcal.devices.live import LiveCamera
-from armcal.diagnose.fit_rows import widened
+from armcal.diagnose.fit import widened
 from armcal.diagnose.verdict import known_accuracies, own_deviations
 from armcal.errors import ArmcalError, ConfigError, ProblemError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate

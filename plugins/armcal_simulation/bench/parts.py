@@ -13,8 +13,7 @@ from armcal.config.selection import with_values
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, Location
-from armcal.run.experiment import Experiment
-from armcal.run.plan_clearance import clearance_check
+from armcal.run.experiment import Experiment, clearance_check
 from pydantic import Field, model_validator
 
 from armcal_simulation.bench.dtrack_sender import DTrackSenderSettings
