@@ -1,7 +1,7 @@
 """Sound recordings of six kinds of instrument, and what the verdict says of them: its false alarms.
 
 Each run draws a true arm and a recording of 20 to 300 records with the stated noise, and calibrates as a user would.
-Prints a table: ``python -m tests.clean_runs [RUNS] [KIND ...] [--first SEED] [--json FILE]``.
+Prints a table: ``python -m tests.clean_runs [RUNS] [KIND ...] [--first SEED] [--write]``.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+RECORD = Path(__file__).resolve().parent / "data" / "clean_runs.json"
+"""What 200 runs of each kind gave; the rates of the checks are tested by it."""
 FEWEST, MOST = 20, 300
 LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
 """How far a true arm is from its drawing."""
@@ -210,28 +212,33 @@ def run(kind: str, seed: int, config: Path) -> Outcome:
     return Outcome(kind, seed, len(dataset), grade, said, seconds)
 
 
+def summary(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Of one kind: how many runs, their grades, and how many of them each check warned of."""
+    grades, checks = Counter(one.grade for one in outcomes), Counter(name for one in outcomes for name in one.checks)
+    return {"runs": len(outcomes), "grades": dict(grades), "checks": dict(checks.most_common())}
+
+
 def main() -> None:
-    """Print a table of grades by kind, and of the checks that warned."""
+    """Print of each kind its grades and the checks that warned; ``--write`` keeps them as the tests expect them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="?", type=int, default=200)
     parser.add_argument("kinds", nargs="*", default=[*KINDS])
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--write", action="store_true")
     words = parser.parse_args()
-    outcomes: list[Outcome] = []
     for kind in words.kinds:
         use_plugins()
         with tempfile.TemporaryDirectory() as place:
             config = KINDS[kind].config(Path(place))
-            for seed in range(words.first, words.first + words.runs):
-                outcomes.append(run(kind, seed, config))
-                if words.json:
-                    words.json.write_text(json.dumps([asdict(outcome) for outcome in outcomes]), encoding="utf-8")
-        own = [outcome for outcome in outcomes if outcome.kind == kind]
-        seconds = sum(outcome.seconds for outcome in own)
-        print(f"{kind:10} {dict(Counter(outcome.grade for outcome in own))} of {len(own)}, {seconds:.0f} s", flush=True)
-        for name, count in Counter(name for outcome in own for name in outcome.checks).most_common():
-            print(f"    {count:4} {name}", flush=True)
+            outcomes = [run(kind, seed, config) for seed in range(words.first, words.first + words.runs)]
+        for outcome in outcomes:
+            for text in outcome.said:
+                print(f"    {outcome.seed:4} {text[:160]}")
+        own, seconds = summary(outcomes), sum(outcome.seconds for outcome in outcomes)
+        print(f"{kind:10} {own}, {seconds:.0f} s", flush=True)
+        if words.write:
+            kept = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
+            RECORD.write_text(json.dumps({**kept, kind: own}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
