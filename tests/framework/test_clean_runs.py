@@ -12,6 +12,8 @@ from armcal.plugins import use_plugins
 from clean_runs import KINDS, RECORD, run
 from scipy.stats import binom
 
+from docs.tools.checks_page import PAGE, as_markdown
+
 RUNS = 4
 
 
@@ -56,3 +58,7 @@ def test_levels_add_up_to_five_percent_of_all_runs() -> None:
     """But that of a held scale, of which few recordings have one."""
     levels = {check.name: float(check.rate.removesuffix(" %")) for check in CHECKS if check.rate.endswith(" %")}
     assert sum(level for name, level in levels.items() if name != "scale") <= 5.0 + 1e-9
+
+
+def test_the_page_of_checks_is_that_of_the_list() -> None:
+    assert as_markdown() == PAGE.read_text(encoding="utf-8")

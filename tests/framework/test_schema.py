@@ -34,7 +34,7 @@ FAST = "--set evaluator=interpreted"
 RUNS: dict[str, tuple[str, ...]] = {
     "run": (
         f"run {DEMO} --out {{out}}/run --json {FAST} --set uncertainty.bootstrap=2 --set validation.folds=2"
-        " --set 'uncertainty.profile=[arm.spring.k1]' --set noise.loss=reject"
+        " --set 'uncertainty.profile=[arm.spring.k1]' --set noise.loss=reject --set validation.limit_mm=1"
         " --set 'parameters.free=[arm.spring.k1, arm.spring.k2]' --accept",
     ),
     "run, noise estimated": (

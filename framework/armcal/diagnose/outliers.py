@@ -42,6 +42,7 @@ class Miss:
     record_id: str
     row: int
     error_mm: float  # its error, by a fit that did not see it where there is one
+    limit_mm: float  # its own limit
     reasons: tuple[str, ...]  # what is unusual about it, in words
     advice: str  # what to do about it
 
@@ -114,7 +115,7 @@ def large_errors(fit: Fit) -> LargeErrors | None:
         efforts = {name: _above(np.abs(loads.efforts)) for name, loads in fit.motion.loads.items()}
         residuals = fit.few.residuals(fit.estimate.values)
         farthest = missed[:MOST_EXPLAINED]
-        explained = tuple(_miss(fit, int(i), float(errors[i]), residuals, leverage, efforts) for i in farthest)
+        explained = tuple(_miss(fit, int(i), errors[i], limits[i], residuals, leverage, efforts) for i in farthest)
     limit = float(np.median(limits[known]))
     return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), explained)
 
@@ -123,6 +124,7 @@ def _miss(
     fit: Fit,
     record: int,
     error_mm: float,
+    limit_mm: float,
     residuals: Sequence[Array],
     leverage: Array,
     efforts: Mapping[str, Array],
@@ -148,7 +150,7 @@ def _miss(
         advice = "measure more poses like it"
     unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
     row = dataset.rows[record] if dataset.rows else 0
-    return Miss(dataset.ids[record], row, error_mm, unusual, advice)
+    return Miss(dataset.ids[record], row, float(error_mm), float(limit_mm), unusual, advice)
 
 
 def _above(numbers: Array) -> Array:
@@ -256,14 +258,14 @@ def outlying(fit: Fit) -> list[Finding]:
     beyond, unit = fit.of(large_errors), fit.unit
     if beyond is None:
         return findings
-    limit, test = f"above {readable(beyond.limit_mm)} {unit}", f"{beyond.judged} records"
+    limit, test = f"{readable(beyond.limit_mm)} {unit}", f"{beyond.judged} records"
     if beyond.configured:
-        what, test = f"an error {limit}", f"{test} by fits that did not see them, limit validation.limit_mm"
+        what, test = f"an error above {limit}", f"{test} by fits that did not see them, limit validation.limit_mm"
     else:
-        what = f"an error beyond what noise explains ({limit} for most records)"
-        test += f", each by its noise and the parameters' uncertainty, {100 * LEVEL:g} % over all"
+        what = "an error beyond what noise explains"
+        test += f", each by its noise and the parameters' uncertainty ({limit} for most), {100 * LEVEL:g} % over all"
     if not beyond.beyond:
-        return [*findings, Finding("good", f"No judged record has {what}.", test)]
+        return [*findings, Finding("good", f"No record has {what}.", test)]
     first = beyond.explained[:MOST_TOLD]
     count = "1 record has" if beyond.beyond == 1 else f"{beyond.beyond} records have"
     if not beyond.configured and beyond.beyond > MOST_SUSPICIOUS * beyond.judged:
@@ -271,7 +273,11 @@ def outlying(fit: Fit) -> list[Finding]:
         text = f"{count} {what}, the worst {listed}. So many are no outliers: {_TOO_MANY}."
         action = "Look in residuals.csv at what they have in common, and state their noise if it is known."
         return [*findings, Finding("warning", text, test, action)]
-    listed = "; ".join(f"{m.record_id} ({readable(m.error_mm)} {unit}: {', '.join(m.reasons)})" for m in first)
+    own = (
+        f"{readable(m.error_mm)} {unit}" + ("" if beyond.configured else f", limit {readable(m.limit_mm)}")
+        for m in first
+    )
+    listed = "; ".join(f"{m.record_id} ({size}: {', '.join(m.reasons)})" for m, size in zip(first, own, strict=True))
     more = f"; and {beyond.beyond - MOST_TOLD} more, in the report" if beyond.beyond > MOST_TOLD else ""
     advice = "; or ".join(dict.fromkeys(miss.advice for miss in first))
     advice = f"{advice.capitalize()}."

@@ -43,6 +43,7 @@ from armcal.measure.groups import PairedMeasurement, pose_numbers
 from armcal.problem.problem import Problem
 
 LEVEL = 0.01
+_NEAR = 0.05  # Of rivals of a cause that is significant: beyond this level one is none
 """Of everything that is tried together: so often something is said of sound data."""
 CLEAR = 3.0  # Logarithm of the odds, 20 to 1, from which on one explanation is preferred
 FEWEST_RECORDS = 30
@@ -405,16 +406,18 @@ class Contest:
             first = tried = self._tried([], DRAWS)
         chosen, whole = dict[int, float](), float(self.residual @ self.residual)
         now = whole
-        while len(chosen) < _MOST_CAUSES and len(significant := np.flatnonzero(tried.p_values <= LEVEL)):
-            # The least Bayesian information criterion, blocks counting as one.
-            sizes = np.array([own.shape[1] for _, own in tried.left])[significant]
+        while len(chosen) < _MOST_CAUSES and np.any(tried.p_values <= LEVEL):
+            # The least Bayesian information criterion, blocks counting as one: a cause of many numbers may fit far
+            # better than the one that its few numbers make significant.
+            near = np.flatnonzero(tried.p_values <= _NEAR)
+            sizes = np.array([own.shape[1] for _, own in tried.left])[near]
             count = self.blocks * self.rows.by_record.shape[1]
-            unexplained = np.maximum(1 - tried.shares[significant], 1e-12)
-            best = int(significant[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
+            unexplained = np.maximum(1 - tried.shares[near], 1e-12)
+            best = int(near[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
             if tried.shares[best] * now < _NEGLIGIBLE * (whole - now):
                 break
             now *= 1 - float(tried.shares[best])
-            chosen[tried.left[best][0]] = float(tried.p_values[best])
+            chosen[tried.left[best][0]] = float(tried.p_values.min())
             tried = self._tried(list(chosen), FEWER_DRAWS)
         return chosen, first, tried
 
