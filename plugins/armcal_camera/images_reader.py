@@ -8,9 +8,7 @@ centre of an image's first pixel is at 0, 0.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import math
 import os
@@ -31,10 +29,10 @@ from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.functions.compiler import cache_directory
-from armcal.io.cells import CellFault, read_cell
 from armcal.io.parallel import Automatic, Report
-from armcal.io.plain_files import input_bytes, refuse, text_of, write_over
+from armcal.io.plain_files import input_bytes, refuse, write_over
 from armcal.measure.reader import ReadRequest
+from armcal.measure.tables import open_table
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board
@@ -47,38 +45,38 @@ _MAX_BYTES = 512 * 1024**2
 _LAYOUT = f"Give a header {','.join(COLUMNS)} and a line a corner."
 
 
-def read_corners(path: Path, boards: Sequence[Board]) -> tuple[dict[str, Array], bytes]:
-    """The corners of each image (K x 2 over all boards, px), in the order in which images appear; and the file.
+def read_corners(path: Path, boards: Sequence[Board]) -> tuple[dict[str, Array], str]:
+    """The corners of each image (K x 2 over all boards, px), in the order in which images appear; and their sha256.
 
     Raises:
         DataError: with line and column.
     """
-    content = input_bytes(path, _MAX_BYTES, "a CSV file of corners")
-    rows = csv.reader(io.StringIO(text_of(content, path, "Save it as CSV text in UTF-8.")))
-    header = [cell.strip() for cell in next(rows, [])]
-    missing = [name for name in COLUMNS if name not in header and (name != "board" or len(boards) > 1)]
-    if missing:
-        text = f"found the columns {', '.join(header) or 'none'}, expected {', '.join(missing)} as well."
-        refuse(path, text, _LAYOUT, 1)
-    at = {name: header.index(name) for name in COLUMNS if name in header}
+    with open_table(path, "a CSV file of corners", most=_MAX_BYTES, empty=_LAYOUT) as table:
+        header = [cell.strip() for cell in table.first[1]]
+        missing = [name for name in COLUMNS if name not in header and (name != "board" or len(boards) > 1)]
+        if missing:
+            text = f"found the columns {', '.join(header) or 'none'}, expected {', '.join(missing)} as well."
+            refuse(path, text, _LAYOUT, 1)
+        texts = [header.index(name) for name in ("image", "point", "board") if name in header]
+        pixels = [(header.index(name), name) for name in ("u_px", "v_px")]
+        read = table.columns(pixels, texts)
+    images, points, *named = read.texts
     starts = np.cumsum([0, *(len(board.points) for board in boards)])
     corners: dict[str, Array] = {}
-    for cells in rows:
-        if not any(cell.strip() for cell in cells):
-            continue
-        line = rows.line_num
-        if len(cells) != len(header):
-            refuse(path, f"found {len(cells)} cells, expected {len(header)} as in the header.", _LAYOUT, line)
-        board = _count(path, line, "board", cells[at["board"]], len(boards)) if "board" in at else 0
-        point = _count(path, line, "point", cells[at["point"]], len(boards[board].points))
-        own = corners.setdefault(cells[at["image"]].strip(), np.full((starts[-1], 2), np.nan))
+    for i, (line, u, v) in enumerate(zip(read.lines, *read.numbers, strict=True)):
+        board = _count(path, line, "board", named[0][i], len(boards)) if named else 0
+        point = _count(path, line, "point", points[i], len(boards[board].points))
+        own = corners.setdefault(images[i].strip(), np.full((starts[-1], 2), np.nan))
         place = own[starts[board] + point]
         if not np.isnan(place).all():
             refuse(path, f"found the point {point} of this image again.", "Remove one of the lines.", line, "point")
-        place[:] = [_pixel(path, line, name, cells[at[name]]) for name in ("u_px", "v_px")]
+        if np.isinf((u, v)).any():
+            column = "u_px" if np.isinf(u) else "v_px"
+            refuse(path, "found an infinite number, expected pixels.", "Leave the line out.", line, column)
+        place[:] = u, v
     if not corners:
         refuse(path, "found a header and no corners.", _LAYOUT)
-    return corners, content
+    return corners, table.sha256
 
 
 def corners_text(corners: Mapping[str, Array], boards: Sequence[Board]) -> str:
@@ -101,15 +99,6 @@ def _count(path: Path, line: int, column: str, cell: str, number: int) -> int:
         message = f"found {text[:40]!r}, expected a whole number from 0 to {number - 1}."
         refuse(path, message, "Check which board of the measurement it is, and count from 0.", line, column)
     return int(text)
-
-
-def _pixel(path: Path, line: int, column: str, cell: str) -> float:
-    value = read_cell(cell)
-    if isinstance(value, CellFault):
-        refuse(path, value.text, value.hint, line, column)
-    if math.isinf(value):
-        refuse(path, "found an infinite number, expected pixels.", "Leave the line out.", line, column)
-    return value
 
 
 _KEPT = 20_000
@@ -255,8 +244,7 @@ class ImagesReader:
         corners = _own(self._settings.corners, camera, cameras)
         if folder is None:
             assert corners is not None
-            given, content = read_corners(corners, boards)
-            digest = hashlib.sha256(content).hexdigest()
+            given, digest = read_corners(corners, boards)
             return {name: View(pixels, _too_few(pixels), sha256=digest) for name, pixels in given.items()}
         paths = _images_in(folder)
         made = Automatic().map(partial(look, boards), paths, report)

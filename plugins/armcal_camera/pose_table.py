@@ -29,12 +29,12 @@ from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.calibration.exporter import rigid_tools
 from armcal.errors import DataError
 from armcal.io.cells import is_number
-from armcal.io.cut_file import may_be_cut, whole_rows
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.layout import warned
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, RequestedChannel
+from armcal.measure.tables import may_be_cut, whole_rows
 from armcal.plugins import discover
 from scipy.spatial.transform import Rotation
 
@@ -344,7 +344,7 @@ def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
     """base_T_flange in metres, row by row: 12 or 16 numbers a line, or a matrix in four lines of four."""
     content = input_bytes(path, _MAX_BYTES, "a table of flange poses")
     rows, matrices, lines = _rows(content.decode("utf-8-sig")), [], []
-    for line, cells in whole_rows(rows, path, "the last column") if may_be_cut(content) else rows:
+    for line, cells in whole_rows(iter(rows), path, "the last column") if may_be_cut(content) else rows:
         if len(cells) not in (12, 16) or not all(is_number(cell) for cell in cells):
             refuse(path, f"found {len(cells)} cells, expected 12 or 16 numbers.", _FORMS, line)
         matrix = np.array([float(cell) for cell in cells]).reshape(-1, 4)

@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -18,14 +19,14 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
-from armcal.io.cells import is_missing, is_number
-from armcal.io.cut_file import may_be_cut, whole_rows
-from armcal.io.plain_files import input_bytes, refuse, text_of
+from armcal.io.cells import CellFault, read_cell
+from armcal.io.plain_files import input_bytes, refuse
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.instrument import named_arm
 from armcal.measure.measurement import GroupedMeasurement, noise_channels
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest, RequestedChannel
+from armcal.measure.tables import open_table
 
 _FULL_TURN = 2 * math.pi
 _NOISE = "noise"
@@ -50,12 +51,11 @@ class MukcaSettings(Settings):
 
 @dataclass(frozen=True)
 class SocketFile:
-    """One file: the position's and the socket's name, and its text."""
+    """One file: the position's and the socket's name, and its content."""
 
     path: Path
     position: str
     socket: str
-    text: str
     raw: bytes
 
 
@@ -138,7 +138,7 @@ def found_files(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
     first: dict[bytes, SocketFile] = {}
     for file in files:  # no ball sits in two sockets in the same postures
         other = first.setdefault(file.raw, file)
-        if other is not file and file.text.strip():
+        if other is not file and file.raw.strip():
             refuse(file.path, f"it is a copy of {other.path}.", "Give each socket its own recording.")
     return tuple(files), tuple(warnings)
 
@@ -151,9 +151,7 @@ def hash_of(files: Sequence[SocketFile]) -> str:
 def _file(path: Path, folder: Path) -> SocketFile:
     if not path.resolve().is_relative_to(folder.resolve()):
         refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
-    raw = input_bytes(path, MAX_BYTES, "a CSV file")
-    text = text_of(raw, path, "Save it as CSV text.")
-    return SocketFile(path, path.parent.name, path.stem, text.replace("\r\n", "\n").replace("\r", "\n"), raw)
+    return SocketFile(path, path.parent.name, path.stem, input_bytes(path, MAX_BYTES, "a CSV file"))
 
 
 def _is_table(path: Path) -> bool:
@@ -164,45 +162,34 @@ def _ignored(path: Path) -> str:
     return f"{path}: it is ignored; only hole_0.csv, hole_1.csv, ... in a position's folder are read."
 
 
-def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> tuple[list[int], Array]:
-    """The lines (from 1) of a file's postures, and the joints' displacements (lines x joints)."""
-    path, lines, numbers, first = file.path, [], [], 0
-    texts = enumerate(file.text.split("\n"), start=1)
-    rows = ((line, text.split(",")) for line, text in texts if text.strip())
-    last = f"column {len(requested_channels)}"
-    for line, cells in whole_rows(rows, path, last) if may_be_cut(file.raw) else rows:
-        first = first or len(cells)
-        if len(cells) != first:
-            mend = "Complete the row, or remove it."
-            refuse(path, f"found {len(cells)} numbers, expected {first} as in the first row.", mend, line)
+def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> tuple[tuple[int, ...], Array]:
+    """The lines (from 1) of a file's postures, and the joints' displacements (lines x joints; rad or m)."""
+    path, hint = file.path, "Give a row a posture, or remove the file."
+    with open_table(path, most=MAX_BYTES, empty=hint, content=file.raw) as table:
+        line, cells = table.first
         if len(cells) != len(requested_channels):
             arm = requested_channels[0].channel.partition(".")[0] if requested_channels else "arm"
-            message = (
+            text = (
                 f"found {len(cells)} columns, expected {len(requested_channels)}: a joint angle of the arm {arm} each."
             )
-            refuse(path, message, "Give this arm's recordings, comma separated.", line)
-        lines.append(line)
-        numbers.append([_number(path, line, i, cell, requested_channels) for i, cell in enumerate(cells)])
-    if not lines:
-        refuse(path, "it is empty.", "Give a row a posture, or remove the file.")
-    return lines, np.array(numbers)
+            refuse(path, text, "Give this arm's recordings, comma separated.", line)
+        names = [f"column {i} ({w.channel.partition('.')[2]})" for i, w in enumerate(requested_channels, 1)]
+        named = list(enumerate(names))
+        read = table.columns(named, has_header=False, number=partial(_number, path))
+    for joint, name, column in zip(requested_channels, names, read.numbers, strict=True):
+        over = np.flatnonzero((np.abs(column) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(column))
+        if joint.dimension == "angle" and not joint.is_endless and over.size:
+            text = f"found {column[over[0]]:.10g} rad, more than one turn (2 pi rad): are these degrees?"
+            refuse(path, text, "Write the angles in rad.", read.lines[over[0]], name)
+    return read.lines, np.array(read.numbers).T
 
 
-def _number(path: Path, line: int, index: int, cell: str, requested_channels: Sequence[RequestedChannel]) -> float:
-    """One cell (rad, or m for a sliding joint)."""
-    text, joint = cell.strip(), requested_channels[index]
-    column = f"column {index + 1} ({joint.channel.partition('.')[2]})"
-    if is_missing(text):
-        return math.nan
-    if not is_number(text):
+def _number(path: Path, line: int, cell: str, name: str) -> float:
+    number = read_cell(cell)
+    if isinstance(number, CellFault):
         header = " These files have no header." if line == 1 else ""
-        mend = f"Correct it, or leave the cell empty to set the record aside.{header}"
-        refuse(path, f"found {text[:40]!r}, expected a number.", mend, line, column)
-    value = float(text)
-    if joint.dimension == "angle" and not joint.is_endless and _FULL_TURN * (1 + 1e-9) < abs(value) < math.inf:
-        message = f"found {value:.10g} rad, more than one turn (2 pi rad): are these degrees?"
-        refuse(path, message, "Write the angles in rad.", line, column)
-    return value
+        refuse(path, number.text, number.hint + header, line, name)
+    return number
 
 
 def _weighed(dataset: Dataset, request: ReadRequest) -> Dataset:

@@ -13,18 +13,10 @@ from armcal.devices.line_source import Begin, FileLines, LineJointStream, Source
 from armcal.devices.live import JointSample, RestStream
 from armcal.errors import ConfigError, DataError
 from armcal.measure.rests import LiveRests, Rows
+from armcal.measure.tables import delimiter_of, line_text, number_of
 from typing_extensions import override
 
-from armcal_dualarm.log_reader import (
-    Column,
-    LogColumns,
-    cells_of,
-    delimiter_of,
-    is_header,
-    number_of,
-    place_of,
-    text_of,
-)
+from armcal_dualarm.log_reader import Column, LogColumns, cells_of, is_header, place_of
 
 
 class TwoArmStreamSettings(LogColumns):
@@ -57,7 +49,7 @@ class _Form:
 
 
 class LiveTable:
-    """Reads rows as ``log_table.read_table`` does.
+    """Reads rows as ``log_reader.read_columns`` does.
 
     Args:
         source: what the log is called in messages.
@@ -76,7 +68,7 @@ class LiveTable:
         Raises:
             DataError: it cannot be read.
         """
-        text = text_of(self._source, None, line)
+        text = line_text(line, self._source).removeprefix("\ufeff")
         if not text.strip():
             return None
         if self._form is None:

@@ -1,12 +1,10 @@
 """Logs of several arms' motors: columns in a robot's own order, in motor radians. [Bergstrom2016]"""
 
 import difflib
-import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain, islice
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NoReturn, Self
 
@@ -16,89 +14,41 @@ from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
-from armcal.io.cells import is_missing, is_number, plain_numbers
-from armcal.io.cut_file import may_be_cut, whole_rows
-from armcal.io.plain_files import input_bytes, refuse
+from armcal.io.cells import is_missing, is_number
+from armcal.io.plain_files import refuse
 from armcal.measure.checks import check_dataset, layout_of
 from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest
 from armcal.measure.rests import Rest, StillSettings, rests
+from armcal.measure.tables import BLANKS, Columns, open_table
 from pydantic import Field, model_validator
-
-MAX_BYTES = 2 * 1024**3
-_ROWS_AT_ONCE = 256
-_DELIMITERS = "\t;|,"  # The likeliest first: where columns are parted by semicolons, commas are decimal ones
-_SAVE_AS_TEXT = "Save the log as text in UTF-8."
 
 Column = str | int  # A column's name in the header, or its number from 1
 
 
-@dataclass(frozen=True)
-class LogTable:
-    """The requested columns."""
-
-    lines: tuple[int, ...]  # of each row (from 1)
-    numbers: Array  # of each number column (columns x rows); NaN where a cell is empty
-    texts: tuple[tuple[str, ...], ...]  # of each text column
-    names: tuple[str, ...]  # what each number column is called in the file
-    sha256: str  # of the file
-
-
-def read_table(path: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]) -> LogTable:
-    """Read columns; ``delimiter`` may be ``auto``, and a blank stands for any blanks.
+def read_columns(
+    path: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]
+) -> tuple[Columns, list[str], str]:
+    """Columns of a log, what those of numbers are called in it, and the file's sha256.
 
     Raises:
         DataError: with file, line and column.
     """
-    raw = input_bytes(path, MAX_BYTES, "a log")
-    rows = _rows(path, raw, delimiter)
-    first = next(rows, None)
-    if first is None:
-        refuse(path, "it is empty.", "Give a row a moment.")
-    line, cells = first
-    header = cells if is_header(cells, numbers, texts) else []
-    places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
-    body = rows if header else chain([first], rows)
-    names = [header[place] if header else f"column {place + 1}" for place in places]
-    if may_be_cut(raw) and len(cells) - 1 in places[: len(numbers)]:
-        body = whole_rows(body, path, header[-1] if header else f"column {len(cells)}")
-    lines, columns, words = _load(path, body, len(cells), places[: len(numbers)], places[len(numbers) :], names)
-    if not lines:
+    with open_table(path, "a log", delimiter, empty="Give a row a moment.") as table:
+        line, cells = table.first[0], [cell.strip() for cell in table.first[1]]
+        header = cells if is_header(cells, numbers, texts) else []
+        places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
+        names = [header[place] if header else f"column {place + 1}" for place in places[: len(numbers)]]
+        named = list(zip(places, names, strict=False))
+        read = table.columns(named, places[len(numbers) :], has_header=bool(header))
+    if not read.lines:
         refuse(path, "found a header and no rows.", "Give a row a moment.", line)
-    return LogTable(lines, columns, words, tuple(names[: len(numbers)]), hashlib.sha256(raw).hexdigest())
-
-
-def _rows(path: Path, raw: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not blank, each with its line."""
-    for line, data in enumerate(raw.splitlines(), start=1):
-        text = text_of(path, line, data)
-        if not text.strip():
-            continue
-        delimiter = delimiter_of(text) if delimiter == "auto" else delimiter
-        yield line, cells_of(text, delimiter)
-
-
-def text_of(path: Path, line: int | None, data: bytes) -> str:
-    """The text of a row.
-
-    Raises:
-        DataError: it is none.
-    """
-    try:
-        text = data.decode("utf-8" if line and line > 1 else "utf-8-sig")
-    except UnicodeDecodeError:
-        refuse(path, "found bytes that are not UTF-8 text.", _SAVE_AS_TEXT, line)
-    if "\0" in text:
-        refuse(path, "found a NUL byte, expected text.", _SAVE_AS_TEXT, line)
-    return text
-
-
-def delimiter_of(text: str) -> str:
-    return next((delimiter for delimiter in _DELIMITERS if delimiter in text), " ")
+    words = tuple(tuple(cell.strip() for cell in column) for column in read.texts)
+    return replace(read, texts=words), names, table.sha256
 
 
 def cells_of(text: str, delimiter: str) -> list[str]:
-    parts = text.split() if delimiter == " " else text.split(delimiter)
+    parts = text.split() if delimiter == BLANKS else text.split(delimiter)
     return [part.strip().strip('"').strip() for part in parts]
 
 
@@ -129,51 +79,6 @@ def place_of(path: Path, line: int | None, header: Sequence[str], count: int, co
         hint = f"The nearest is {' or '.join(near)}." if near else f"The columns are {', '.join(header[:20])[:200]}."
         refuse(path, f"{text}, expected it once.", hint, line, column)
     return header.index(column)
-
-
-def _load(
-    path: Path,
-    rows: Iterator[tuple[int, list[str]]],
-    count: int,
-    numbers: Sequence[int],
-    texts: Sequence[int],
-    names: Sequence[str],
-) -> tuple[tuple[int, ...], Array, tuple[tuple[str, ...], ...]]:
-    lines: list[int] = []
-    blocks: list[Array] = [np.zeros((len(numbers), 0))]
-    words: list[list[str]] = [[] for _ in texts]
-    while block := list(islice(rows, _ROWS_AT_ONCE)):
-        ragged = next(((line, cells) for line, cells in block if len(cells) != count), None)
-        if ragged:
-            mend = "Complete the row, or give the delimiter; numbers have a decimal point."
-            refuse(path, f"found {len(ragged[1])} cells, expected {count} as in the first row.", mend, ragged[0])
-        block_lines = [line for line, _ in block]
-        table = list(zip(*(cells for _, cells in block), strict=True))
-        columns = []
-        for at, name in zip(numbers, names, strict=False):
-            column = plain_numbers(table[at])
-            if column is None:
-                pairs = zip(block_lines, table[at], strict=True)
-                column = np.array([number_of(path, line, cell, name) for line, cell in pairs])
-            columns.append(column)
-        blocks.append(np.array(columns))
-        for own, at in zip(words, texts, strict=True):
-            own += table[at]
-        lines += block_lines
-    return tuple(lines), np.hstack(blocks), tuple(tuple(own) for own in words)
-
-
-def number_of(path: Path, line: int | None, cell: str, name: str) -> float:
-    """A cell's number; NaN where it is empty.
-
-    Raises:
-        DataError: it is none.
-    """
-    if is_number(cell):
-        return float(cell)
-    if is_missing(cell):
-        return math.nan
-    refuse(path, f"found {cell[:40]!r}, expected a number.", "Correct it, or leave the cell empty.", line, name)
 
 
 class ArmColumns(Settings):
@@ -273,13 +178,13 @@ class TwoArmLogReader:
                 text = f"found {len(arm.columns)} columns for the arm {name}, which has {joints} joints."
                 self._refuse(text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
         channels = [f"{name}.{joint}" for name in s.arms for joint in request.arms[name].commanded]
-        numbers = [column for arm in s.arms.values() for column in arm.from_base]
         times = [] if s.time is None else [s.time]
-        table = read_table(path, s.delimiter, [*numbers, *times], list(s.labels.values()))
+        numbers = [*(column for arm in s.arms.values() for column in arm.from_base), *times]
+        read, column_names, digest = read_columns(path, s.delimiter, numbers, list(s.labels.values()))
         ratios = np.concatenate([arm.ratios for arm in s.arms.values()])
-        joint_angles = table.numbers[: len(numbers)] / ratios[:, None]
+        joint_angles = np.array(read.numbers[: len(channels)]) / ratios[:, None]
         values = dict(zip(channels, joint_angles, strict=True))
-        names = dict(zip(channels, table.names, strict=False))
+        names = dict(zip(channels, column_names, strict=False))
         turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
         for channel, row in values.items():
             over = np.flatnonzero((np.abs(row) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(row))
@@ -287,33 +192,33 @@ class TwoArmLogReader:
                 first = int(over[0])
                 text = f"{channel} would stand at {row[first]:.6g} rad there, more than one turn (2 pi rad)."
                 hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
-                self._refuse(text, hint, table.lines[first], names[channel])
+                self._refuse(text, hint, read.lines[first], names[channel])
         if times:
-            values["time"] = from_unit(table.numbers[len(numbers)], s.time_unit)
-        dataset = with_absent(self._dataset(table, joint_angles, values), request.channels)
+            values["time"] = from_unit(read.numbers[-1], s.time_unit)
+        dataset = with_absent(self._dataset(read, digest, joint_angles, values), request.channels)
         return check_dataset(dataset, layout_of(request.channels, dataset, names, {}, by_line=True))
 
-    def _dataset(self, table: LogTable, joints: Array, values: Mapping[str, Array]) -> Dataset:
+    def _dataset(self, read: Columns, digest: str, joints: Array, values: Mapping[str, Array]) -> Dataset:
         """All rows, or the means of the rests among them."""
         s = self._settings
-        still = [Rest(i, i + 1) for i in range(len(table.lines))]
+        still = [Rest(i, i + 1) for i in range(len(read.lines))]
         warnings: tuple[str, ...] = ()
         if s.still is not None:
-            still = rests(joints, table.texts, values.get("time"), s.still)
+            still = rests(joints, read.texts, values.get("time"), s.still)
             if not still:
                 text = f"found no moment at which no joint moves by more than {np.degrees(s.still.spread):.3g} deg."
                 self._refuse(text, "Give a wider spread_deg or a shorter window under still.")
             used = sum(rest.stop - rest.start for rest in still)
-            rows = f"{used} of {len(table.lines)} rows"
+            rows = f"{used} of {len(read.lines)} rows"
             warnings = (f"{s.path}: the log was reduced to {len(still)} still moments, the means of {rows}.",)
         starts = [rest.start for rest in still]
         channels = {
             name: np.array([row[rest.start : rest.stop].mean() for rest in still]) for name, row in values.items()
         }
-        lines = tuple(table.lines[i] for i in starts)
-        texts = {name: tuple(cells[i] for i in starts) for name, cells in zip(s.labels, table.texts, strict=True)}
+        lines = tuple(read.lines[i] for i in starts)
+        texts = {name: tuple(cells[i] for i in starts) for name, cells in zip(s.labels, read.texts, strict=True)}
         ids = tuple(map(str, lines))
-        return Dataset(ids, channels, texts, lines, str(s.path), table.sha256, warnings=warnings)
+        return Dataset(ids, channels, texts, lines, str(s.path), digest, warnings=warnings)
 
     def _refuse(self, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
         raise DataError(message, where=Location(str(self._settings.path), line=line, field=column), hint=hint)

@@ -1,18 +1,8 @@
-"""Records from a CSV file: a header, columns by name with their unit as suffix (``q1_deg``, ``x_mm``).
+"""Records from a CSV file: a header, columns by name with their unit as suffix (``q1_deg``, ``x_mm``)."""
 
-The file is read once, line by line, and its columns are turned into numbers a few hundred rows at a time, so that
-neither a long file nor a broken one takes much memory. A single bad cell is looked for only when a column fails.
-"""
-
-import csv
-import hashlib
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
-from itertools import islice
-from pathlib import Path
-from typing import Annotated, Any, BinaryIO, ClassVar, Literal, NoReturn, Self
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -22,22 +12,15 @@ from armcal.base.settings import InputPath, Settings
 from armcal.base.units import DIMENSIONLESS, from_unit
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.errors import DataError, Location
-from armcal.io.cells import DECIMAL_COMMA, CellFault, plain_numbers, read_cell, with_point
-from armcal.io.cut_file import may_be_cut, whole_rows
-from armcal.io.plain_files import input_file, refuse
+from armcal.io.cells import DECIMAL_COMMA, CellFault, read_cell, with_point
 from armcal.measure.checks import Layout, check_dataset, layout_of, require_records
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
 from armcal.measure.layout import set_aside, warned
 from armcal.measure.reader import ReadRequest, RequestedChannel
+from armcal.measure.tables import Row, Table, open_table
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
-
-MAX_BYTES = 2 * 1024**3
-MAX_LINE_BYTES = 1024**2
-
-_ROWS_AT_ONCE = 256  # small blocks stay in the processor's cache: faster than thousands
-_SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
 
 
 class CsvSettings(Settings):
@@ -73,74 +56,21 @@ class CsvReader:
         Raises:
             DataError: with file, line and column.
         """
-        s, digest = self._settings, hashlib.sha256()
-        path, source = s.path, str(s.path)
-        try:
-            with input_file(path, MAX_BYTES, "a CSV file") as file:
-                if not os.fstat(file.fileno()).st_size:
-                    refuse(path, "it is empty.", "Give a header and one line a record.")
-                rows = _rows(_text_lines(file, path, digest), path, s.delimiter)
-                line, cells = next(rows, (1, []))
-                header = header_of(cells, source, line, request.layout_hint)
-                if len(cells) == 1:
-                    _refuse_delimiter(header, s.delimiter, rows)
-                header = renamed(header, s.columns)
-                plan = match_columns(header, request.channels)
-                if may_be_cut(_end(file)) and any(c is header.columns[-1] for c, _ in plan.channels.values()):
-                    rows = whole_rows(rows, path, header.columns[-1].name)
-                dataset = _load(rows, header, plan, s.decimal == ",")
-        except OSError as fault:
-            refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
-        dataset = replace(dataset, sha256=digest.hexdigest())
+        s, source = self._settings, str(self._settings.path)
+        with open_table(s.path, delimiter=s.delimiter) as table:
+            line, cells = table.first
+            header = header_of(cells, source, line, request.layout_hint)
+            if len(cells) == 1:
+                _refuse_delimiter(header, s.delimiter, table.rest)
+            header = renamed(header, s.columns)
+            plan = match_columns(header, request.channels)
+            dataset = _load(table, header, plan, s.decimal == ",")
         names = {channel: column.name for channel, (column, _) in plan.channels.items()}
         units = {channel: unit for channel, (_, unit) in plan.channels.items()}
         return check_dataset(dataset, layout_of(request.channels, dataset, names, units, by_line=True))
 
 
-def _text_lines(file: BinaryIO, path: Path, digest: Any) -> Iterator[str]:
-    """The file as text, each line checked as it comes by; all its bytes go into ``digest``."""
-    offset = 0
-    for number, raw in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), start=1):
-        digest.update(raw)
-        if b"\0" in raw:
-            at = offset + raw.index(b"\0")
-            refuse(path, f"found a NUL byte at offset {at}, expected text.", _SAVE_AS_TEXT, number)
-        if len(raw) > MAX_LINE_BYTES:
-            refuse(path, "found a line of more than 1 MiB, expected a record.", _SAVE_AS_TEXT, number)
-        try:
-            text = raw.decode("utf-8")
-        except UnicodeDecodeError as fault:
-            at = offset + fault.start
-            message = f"found the byte 0x{raw[fault.start]:02x} at offset {at}, which is not UTF-8 text."
-            refuse(path, message, _SAVE_AS_TEXT, number)
-        yield text.removeprefix("\ufeff") if number == 1 else text
-        offset += len(raw)
-
-
-def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """Rows that are not blank, each with the line on which it begins."""
-    reader = csv.reader(lines, delimiter=delimiter, strict=True)
-    line = 1
-    try:
-        for cells in reader:
-            if len(cells) > 1 or (cells and cells[0].strip()):
-                yield line, cells
-            line = reader.line_num + 1
-    except csv.Error as fault:
-        hint = "Close every quote, end lines with LF or CRLF, and put no bare quote inside a quoted cell."
-        refuse(path, f"found a row that is not CSV ({fault}).", hint, line)
-
-
-def _end(file: BinaryIO) -> bytes:
-    """The last byte; the file is read on from where it was."""
-    here = file.tell()
-    file.seek(-1, os.SEEK_END)
-    last = file.read(1)
-    file.seek(here)
-    return last
-
-
-def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, list[str]]]) -> None:
+def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[Row]) -> None:
     """A header of one cell that holds another delimiter."""
     name = header.columns[0].name
     other = next((d for d in ";\t|," if d in name and d != delimiter), None)
@@ -158,41 +88,28 @@ def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[tuple[int, 
     header.refuse_layout(text, f'{mend}, and decimal: ",".')
 
 
-def _load(rows: Iterator[tuple[int, list[str]]], header: Header, plan: Plan, has_commas: bool) -> Dataset:
-    """All rows, a block of them at a time; records without an id are set aside."""
-    ids: list[str] = []
-    places: list[int] = []
-    blocks: dict[str, list[Array]] = {channel: [] for channel in plan.channels}
-    texts: dict[str, list[str]] = {column.known_as: [] for column in plan.extra}
-    while block := list(islice(rows, _ROWS_AT_ONCE)):
-        lines = [line for line, _ in block]
-        for line, row in block:
-            count, expected = len(row), len(header.columns)
-            if count != expected:
-                mend = "Complete the row (was the file cut off?); leave a cell empty if its value is not known."
-                if row[0].lstrip().startswith("#"):
-                    mend = "Remove the line: comments are not read."
-                elif count > expected:
-                    mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
-                message = f"found {count} cells, expected {expected} as in the header."
-                raise DataError(message, where=Location(header.source, line=line), hint=mend)
-        table = list(zip(*(cells for _, cells in block), strict=True))
-        for channel, (column, unit) in plan.channels.items():
-            cells = table[column.index]
-            numbers = None if has_commas else plain_numbers(cells)
-            if numbers is None:
-                read = partial(_number, column=column, header=header, has_commas=has_commas)
-                numbers = np.array([read(cell, line) for cell, line in zip(cells, lines, strict=True)])
-            blocks[channel].append(from_unit(numbers, unit))
-        for column in plan.extra:
-            texts[column.known_as] += table[column.index]
-        ids += [cell.strip() for cell in table[plan.record_id.index]] if plan.record_id else map(str, lines)
-        places += lines
-    if not places:
+def _load(table: Table, header: Header, plan: Plan, has_commas: bool) -> Dataset:
+    """All rows; records without an id are set aside."""
+    named, by_name = [*plan.channels.items()], {column.name: column for column in header.columns}
+    texts = [column.index for column in plan.extra]
+
+    def number(line: int, cell: str, name: str) -> float:
+        return _number(cell, line, by_name[name], header, has_commas)
+
+    read = table.columns(
+        [(column.index, column.name) for _, (column, _) in named],
+        texts if plan.record_id is None else [*texts, plan.record_id.index],
+        number=number,
+        plain=not has_commas,
+    )
+    if not read.lines:
         header.refuse("found a header and no records.", "Add one line a record.")
-    channels = {channel: np.concatenate(parts) for channel, parts in blocks.items()}
-    extra = {name: tuple(cells) for name, cells in texts.items()}
-    dataset = Dataset(tuple(ids), channels, extra, tuple(places), header.source)
+    ids = [cell.strip() for cell in read.texts[-1]] if plan.record_id else [*map(str, read.lines)]
+    channels = {
+        channel: from_unit(column, unit) for (channel, (_, unit)), column in zip(named, read.numbers, strict=True)
+    }
+    extra = {column.known_as: cells for column, cells in zip(plan.extra, read.texts, strict=False)}
+    dataset = Dataset(tuple(ids), channels, extra, read.lines, header.source, table.sha256)
     nameless = {i: "its id is empty" for i, name in enumerate(ids) if not name}
     if not nameless:
         return dataset

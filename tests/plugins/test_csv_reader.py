@@ -16,11 +16,10 @@ from armcal.base.units import from_unit
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import EXIT_BAD_INPUT, DataError
-from armcal.io.cut_file import is_cut
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ENVIRONMENT, ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.tables import MAX_BYTES, is_cut
 from armcal_mdh.model import MdhModel, MdhSettings, Row
-from armcal_tracker import csv_reader
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings
 from pydantic import ValidationError
@@ -356,7 +355,7 @@ def test_not_a_file(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot be read .* Check its permissions"):
         CsvReader(CsvSettings(path=tmp_path / ("a" * 300))).read(request)
     with (tmp_path / "large.csv").open("wb") as sparse:
-        sparse.truncate(csv_reader.MAX_BYTES + 1)
+        sparse.truncate(MAX_BYTES + 1)
     with pytest.raises(DataError, match=r"large\.csv: it is larger than 2 GiB"):
         CsvReader(CsvSettings(path=tmp_path / "large.csv")).read(request)
 

@@ -156,7 +156,7 @@ def test_only_a_sliding_joint_may_be_beyond_two_pi(tmp_path):
     [
         ("front__hole_0", "", "hole_0.csv: it is empty"),
         ("front__hole_0", "\n \n", "hole_0.csv: it is empty"),
-        ("front__hole_0", "0.1,0.2,0.3\n0.1,0.2\n", "hole_0.csv:2: found 2 numbers, expected 3 as in the first row"),
+        ("front__hole_0", "0.1,0.2,0.3\n0.1,0.2\n", "hole_0.csv:2: found 2 cells, expected 3 as in the first row"),
         (
             "back__hole_1",
             "0.1,0.2\n0.3,0.4\n",
@@ -173,7 +173,7 @@ def test_only_a_sliding_joint_may_be_beyond_two_pi(tmp_path):
         (
             "back__hole_1",
             "0.1,0.2,0.312\n" * 11 + "0.1,0.2,0.3",
-            "hole_1.csv:12, column 3: the file ends in '0.3' without a line end",
+            "hole_1.csv:12, column 3 (q3): the file ends in '0.3' without a line end",
         ),
         ("back__hole_1", b"1,2,3\n1,\xff,3\n", "hole_1.csv:2: found the byte 0xff"),
         ("back__hole_1", b"1,2,3\n1,2\0,3\n", "hole_1.csv:2: found a NUL byte"),

@@ -229,7 +229,7 @@ def test_creeping_joints_are_not_at_rest(tmp_path):
             {},
             "log.txt:12, column 14: the file ends in",
         ),
-        (b"1,\xff\n", {}, "log.txt:1: found bytes that are not UTF-8"),
+        (b"1,\xff\n", {}, "log.txt:1: found the byte 0xff at offset 2, which is not UTF-8 text"),
         ("a,a\n" * 2, {"arms": {"left": {"columns": list("abcdefg")}}}, "found the column a 2 times"),
     ],
 )

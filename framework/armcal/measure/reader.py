@@ -1,6 +1,5 @@
 """Readers: where datasets come from, the channels that they are asked for, and lists of record ids."""
 
-import csv
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +11,10 @@ from armcal.arm.effects import JOINT_RATE, joint_rate
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.io.parallel import Report, unreported
-from armcal.io.plain_files import input_bytes, refuse, text_of
+from armcal.io.plain_files import refuse
 from armcal.measure.instrument import PointMeasurement
 from armcal.measure.measurement import Measurement, noise_channels
+from armcal.measure.tables import open_table
 
 
 @dataclass(frozen=True)
@@ -194,15 +194,12 @@ def read_ids(path: Path) -> tuple[str, ...]:
     Raises:
         DataError: no such file, no text, no ids, or an id stands twice.
     """
-    text = text_of(input_bytes(path, MAX_ID_LIST_BYTES, "a list of ids"), path, "Save it as CSV text in UTF-8.")
-    rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
-    if not rows:
-        refuse(path, "it is empty.", _ID_HEADER)
-    header = [cell.strip().lower() for cell in rows[0]]
-    column = next((header.index(name) for name in ID_NAMES if name in header), None)
-    if column is None:
-        refuse(path, f"found the columns {', '.join(rows[0])}.", _ID_HEADER)
-    ids = [row[column].strip() for row in rows[1:] if len(row) > column]
+    with open_table(path, "a list of ids", most=MAX_ID_LIST_BYTES, empty=_ID_HEADER) as table:
+        header = [cell.strip().lower() for cell in table.first[1]]
+        column = next((header.index(name) for name in ID_NAMES if name in header), None)
+        if column is None:
+            refuse(path, f"found the columns {', '.join(table.first[1])}.", _ID_HEADER)
+        ids = [cells[column].strip() for _, cells in table.rest if len(cells) > column]
     if not ids:
         refuse(path, "it lists no ids.", "Give an id a line below the header.")
     twice = sorted({record for record in ids if ids.count(record) > 1}) if len(set(ids)) < len(ids) else []

@@ -1,0 +1,278 @@
+"""Tables of text: cells by line, with a header or without, and columns as numbers; each fault with line and column.
+
+A file is read once, line by line, and its columns become numbers a few hundred rows at a time, so that neither a long
+file nor a broken one takes much memory. A single bad cell is looked for only when a column fails.
+
+A file may have been cut off: an interrupted copy, a full disk. A row that lost cells shows by their number. A last
+number that lost digits is a number still, which only those above it give away. That a file ends without a line end says
+nothing: many editors write it so.
+"""
+
+import csv
+import hashlib
+import io
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from armcal.base.arrays import Array
+from armcal.io.cells import CellFault, plain_numbers, read_cell
+from armcal.io.plain_files import input_file, refuse
+
+MAX_BYTES = 2 * 1024**3
+MAX_LINE_BYTES = 1024**2
+BLANKS = " "
+"""As a delimiter: any number of blanks."""
+
+_ROWS_AT_ONCE = 256  # small blocks stay in the processor's cache: faster than thousands
+_LIKELY = "\t;|,"  # The likeliest first: where columns are parted by semicolons, commas are decimal ones
+_SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
+_PARTS = re.compile(r"\s*[+-]?[0-9]*(?:[.,](?P<decimals>[0-9]*))?(?:[eE][+-]?(?P<exponent>[0-9]+))?\s*")
+_FEWEST_OTHERS = 10
+
+Row = tuple[int, list[str]]
+"""The line on which a row begins, and its cells."""
+Number = Callable[[int, str, str], float]
+"""The number in a cell, of a line and a column's name; NaN where it is missing."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What was read of a table."""
+
+    lines: tuple[int, ...]  # of each row
+    numbers: tuple[Array, ...]  # of each number column; NaN where a cell is empty
+    texts: tuple[tuple[str, ...], ...]  # of each text column
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table that is open; its rows, those that are not blank, are read once.
+
+    Attributes:
+        first: its first row, a header or not.
+        rest: the rows after it.
+        may_be_cut: whether the file ends without a line end.
+    """
+
+    path: Path
+    first: Row
+    rest: Iterator[Row]
+    may_be_cut: bool
+    _digest: "hashlib._Hash"
+
+    @property
+    def sha256(self) -> str:
+        """Of the file, once all rows were read."""
+        return self._digest.hexdigest()
+
+    def columns(
+        self,
+        numbers: Sequence[tuple[int, str]],
+        texts: Sequence[int] = (),
+        *,
+        has_header: bool = True,
+        number: Number | None = None,
+        plain: bool = True,
+    ) -> Columns:
+        """Columns by their places from 0, those of numbers with their names.
+
+        Args:
+            numbers, texts: which.
+            has_header: whether the first row is one; else it is read too.
+            number: reads a cell that is no plain number; by default ``number_of``.
+            plain: whether a cell that Python reads as a number is that number.
+
+        Raises:
+            DataError: with file, line and column.
+        """
+        rows, width = self.rest if has_header else chain([self.first], self.rest), len(self.first[1])
+        last = next((name for place, name in numbers if place == width - 1), None)
+        if self.may_be_cut and last is not None:
+            rows = whole_rows(rows, self.path, last)
+        number = number or partial(number_of, self.path)
+        lines, blocks, words = list[int](), [list[Array]() for _ in numbers], [list[str]() for _ in texts]
+        while block := list(islice(rows, _ROWS_AT_ONCE)):
+            for line, cells in block:
+                if len(cells) != width:
+                    self._refuse_ragged(line, cells, width, "header" if has_header else "first row")
+            own = [line for line, _ in block]
+            table = list(zip(*(cells for _, cells in block), strict=True))
+            for (place, name), parts in zip(numbers, blocks, strict=True):
+                column = plain_numbers(table[place]) if plain else None
+                if column is None:
+                    column = np.array([number(line, cell, name) for line, cell in zip(own, table[place], strict=True)])
+                parts.append(column)
+            for place, word in zip(texts, words, strict=True):
+                word += table[place]
+            lines += own
+        columns = tuple(np.concatenate(parts) if parts else np.zeros(0) for parts in blocks)
+        return Columns(tuple(lines), columns, tuple(map(tuple, words)))
+
+    def _refuse_ragged(self, line: int, cells: Sequence[str], width: int, like: str) -> None:
+        mend = "Complete the row (was the file cut off?); leave a cell empty if its value is not known."
+        if cells[0].lstrip().startswith("#"):
+            mend = "Remove the line: comments are not read."
+        elif len(cells) > width:
+            mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
+        refuse(self.path, f"found {len(cells)} cells, expected {width} as in the {like}.", mend, line)
+
+
+@contextmanager
+def open_table(
+    path: Path,
+    what: str = "a CSV file",
+    delimiter: str = ",",
+    *,
+    most: int = MAX_BYTES,
+    empty: str = "Give a header and one line a record.",
+    content: bytes | None = None,
+) -> Iterator[Table]:
+    """A file as a table.
+
+    Args:
+        path: of the file.
+        what: it should be, with its article.
+        delimiter: between cells; ``auto`` for the likeliest in the first row, ``BLANKS`` for any blanks.
+        most: bytes that it may have.
+        empty: what to do if it is empty.
+        content: of the file, where it was read already.
+
+    Raises:
+        DataError: it cannot be read, is empty or no text; also while its rows are read.
+    """
+    digest = hashlib.sha256()
+    try:
+        with input_file(path, most, what) if content is None else io.BytesIO(content) as file:
+            rows = _rows(_text_lines(file, path, digest), path, delimiter)
+            last = _last_byte(file)
+            first = next(rows, None)
+            if first is None:
+                refuse(path, "it is empty.", empty)
+            yield Table(path, first, rows, may_be_cut(last), digest)
+    except OSError as fault:
+        refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
+
+
+def may_be_cut(end: bytes) -> bool:
+    """Whether text that ends so has no last line end."""
+    return end[-1:] not in (b"\n", b"\r", b'"')
+
+
+def _last_byte(file: BinaryIO) -> bytes:
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - 1, 0))
+    last = file.read(1)
+    file.seek(0)
+    return last
+
+
+def _text_lines(file: BinaryIO, path: Path, digest: "hashlib._Hash") -> Iterator[str]:
+    """The file as text, each line checked as it comes by; all its bytes go into ``digest``."""
+    offset = 0
+    for number, raw in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), start=1):
+        digest.update(raw)
+        if len(raw) > MAX_LINE_BYTES:
+            refuse(path, "found a line of more than 1 MiB, expected a record.", _SAVE_AS_TEXT, number)
+        text = line_text(raw, path, number, offset)
+        yield text.removeprefix("\ufeff") if number == 1 else text
+        offset += len(raw)
+
+
+def line_text(raw: bytes, path: Path, number: int | None = None, offset: int | None = None) -> str:
+    """The text of a line, by its number and its offset in the file where it has one.
+
+    Raises:
+        DataError: it is none.
+    """
+    text, at, what = "", raw.find(b"\0"), "a NUL byte{}, expected text"
+    if at < 0:
+        try:
+            text = raw.decode("utf-8")
+        except UnicodeDecodeError as fault:
+            at, what = fault.start, f"the byte 0x{raw[fault.start]:02x}{{}}, which is not UTF-8 text"
+    if at >= 0:
+        there = "" if offset is None else f" at offset {offset + at}"
+        refuse(path, f"found {what.format(there)}.", _SAVE_AS_TEXT, number)
+    return text
+
+
+def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
+    """Rows that are not blank."""
+    begun = 1
+    if delimiter == "auto":
+        for text in lines:
+            if text.strip():
+                delimiter, lines = delimiter_of(text), chain([text], lines)
+                break
+            begun += 1
+        else:
+            return
+    if delimiter == BLANKS:
+        split = ((number, text.split()) for number, text in enumerate(lines, begun))
+        yield from ((number, [cell.strip('"') for cell in cells]) for number, cells in split if cells)
+        return
+    reader, line = csv.reader(lines, delimiter=delimiter, strict=True), begun
+    try:
+        for cells in reader:
+            if len(cells) > 1 or (cells and cells[0].strip()):
+                yield line, cells
+            line = begun + reader.line_num
+    except csv.Error as fault:
+        hint = "Close every quote, end lines with LF or CRLF, and put no bare quote inside a quoted cell."
+        refuse(path, f"found a row that is not CSV ({fault}).", hint, line)
+
+
+def delimiter_of(text: str) -> str:
+    """The likeliest between the cells of a line."""
+    return next((delimiter for delimiter in _LIKELY if delimiter in text), BLANKS)
+
+
+def number_of(path: Path, line: int | None, cell: str, name: str) -> float:
+    """A cell's number; NaN where it is empty.
+
+    Raises:
+        DataError: it is none.
+    """
+    number = read_cell(cell)
+    if isinstance(number, CellFault):
+        refuse(path, number.text, number.hint, line, name)
+    return number
+
+
+def whole_rows(rows: Iterator[Row], path: Path, column: str) -> Iterator[Row]:
+    """Rows of a file without a last line end, as they come; the last one is refused if its number lost its end."""
+    cells, line = list[str](), 0
+    for line, row in rows:
+        cells.append(row[-1])
+        yield line, row
+    if is_cut(cells):
+        text = f"the file ends in {cells[-1].strip()!r} without a line end, and every other number here has more digits"
+        hint = "Copy the whole file again, or remove this row. If nothing is missing, end its line."
+        refuse(path, f"{text}: was the file cut off?", hint, line, column)
+
+
+def is_cut(column: Sequence[str]) -> bool:
+    """Whether the last number of a column has fewer digits after the decimal sign, or in the exponent, than all others.
+
+    One fewer where zeros are written out (12.50); two where they are left out, as one number of a hundred ends in two
+    zeros. A whole number tells nothing among whole numbers.
+    """
+    last = _PARTS.fullmatch(column[-1]) if column and column[-1].strip() else None
+    others = [parts for cell in column[:-1] if cell.strip() and (parts := _PARTS.fullmatch(cell))]
+    if last is None or len(others) < _FEWEST_OTHERS:
+        return False
+    decimals = [parts["decimals"] or "" for parts in others]
+    fewest = min(map(len, decimals))
+    writes_zeros = fewest == max(map(len, decimals)) and any(digits.endswith("0") for digits in decimals)
+    lost = fewest - len(last["decimals"] or "")
+    lost_exponent = min(len(parts["exponent"] or "") for parts in others) - len(last["exponent"] or "")
+    return lost_exponent > 0 or lost > (0 if writes_zeros else 1)
