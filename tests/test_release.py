@@ -252,7 +252,7 @@ WITH = {
     "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); import armcal_pca9685.linux_i2c",
     "mujoco": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco><worldbody/></mujoco>')",
     "camera": "import cv2; cv2.aruco.CharucoBoard((5, 4), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(0))",
-    "ros2": "from armcal_ros2.message import message_types; message_types()",
+    "ros2": "import rosbags.rosbag2, rosbags.typesys",
     "docs": "import mkdocs, material, pymdownx, latex2mathml",
     "dev": "import ruff, mypy.api, yaml",
     "test": "import pytest, hatchling, xdist, hypothesis, pinocchio, distributed",

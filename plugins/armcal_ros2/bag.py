@@ -1,24 +1,22 @@
-"""A recording: a folder of files, or one file."""
+"""A recording: a folder of files, or one file, as ``rosbags`` reads them."""
 
 import re
-import sqlite3
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
-from urllib.parse import quote
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import yaml
 from armcal.base.settings import Settings
-from armcal.io.plain_files import input_bytes, input_file, refuse
+from armcal.io.plain_files import refuse
+from armcal.plugins import library, said
 
-from armcal_ros2.mcap import McapFile
-from armcal_ros2.message import MAX_BYTES, RawMessage, Topic, decompressed, message_types
-
+JOINT_STATE = "sensor_msgs/msg/JointState"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_PURPOSE = "reading recordings of ROS 2"
 _MOST_DELAYS = 4096
 _FAR_S, _FEW = 10.0, 10
 """A stamp that is so far from the others, by the time of receipt, is wrong; after so many at the begin, the others."""
@@ -27,6 +25,13 @@ _EARLIER = "a stamp before that of an earlier one"
 _MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _FAR: 0.5, _EARLIER: 0.01})
 """A larger part of the messages, and times are not to be trusted."""
 Clock = Literal["header", "receive"]
+
+
+class Topic(NamedTuple):
+    """A topic: its name, and its messages' type (``sensor_msgs/msg/JointState``)."""
+
+    name: str
+    type: str
 
 
 class TopicSettings(Settings):
@@ -102,83 +107,31 @@ def nanoseconds(stamp: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-MAGIC = b"SQLite format 3\0"
-_ROWS = "SELECT topic_id, timestamp, CASE WHEN topic_id IN ({0}) THEN data END FROM messages ORDER BY id"
-_HINT = "Give a recording of ROS 2: a folder with metadata.yaml, or a file .mcap or .db3."
-
-
-class SqliteFile:
-    """One file.
-
-    Attributes:
-        path: of the file.
-        faults: what of it could not be read, known once all messages were asked for.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.faults: list[str] = []
-
-    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[RawMessage]:
-        """All messages in the order of the file; those that are not chosen have no data.
-
-        Raises:
-            DataError: it is no SQLite file of rosbag2.
-        """
-        self.faults = []
-        with input_file(self.path, MAX_BYTES, "a recording") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                refuse(self.path, "found other content than that of an SQLite file.", _HINT)
-        try:
-            connection, topics = self._opened()
-        except sqlite3.Error as fault:
-            refuse(self.path, f"found no topics of a recording in it ({fault}).", _HINT)
-        with closing(connection):
-            chosen = ", ".join(str(int(key)) for key, topic in topics.items() if is_read(topic))
-            count = 0
-            try:
-                for key, received, data in connection.execute(_ROWS.format(chosen)):
-                    count += 1
-                    if key in topics and isinstance(received, int) and isinstance(data, bytes | None):
-                        yield RawMessage(topics[key], received, data)
-            except (sqlite3.Error, MemoryError) as fault:  # memory: a length that is damaged
-                self.faults.append(f"it is cut off or damaged after {count} messages ({fault}); these were read")
-
-    def _opened(self) -> tuple[sqlite3.Connection, dict[int, Topic]]:
-        """The file and its topics; where its journal cannot be used it is left aside.
-
-        Raises:
-            sqlite3.Error: it has no topics.
-        """
-        for more in ("", "&immutable=1"):
-            connection = sqlite3.connect(f"file:{quote(str(self.path.absolute()))}?mode=ro{more}", uri=True)
-            try:
-                connection.execute("PRAGMA writable_schema = ON")  # or a file that is cut off is not even opened
-                rows = connection.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-                connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
-            except sqlite3.Error:
-                connection.close()
-                if more:
-                    raise
-                continue
-            if more:
-                self.faults.append("its journal could not be used: the last messages may be missing")
-            return connection, {key: Topic(*map(str, rest)) for key, *rest in rows}
-        raise AssertionError("both ways are tried")
-
-
 _METADATA = "metadata.yaml"
-_KINDS: Mapping[str, type[McapFile | SqliteFile]] = MappingProxyType({".mcap": McapFile, ".db3": SqliteFile})
-_ZSTD = b"\x28\xb5\x2f\xfd"
+_KINDS = (".mcap", ".db3")
 _EXPECTED = "Give a recording of ROS 2: a folder with metadata.yaml, or a file .mcap or .db3."
+_RECOVER = (
+    "If its recorder was killed: mcap recover FILE.mcap -o NEW.mcap makes a whole file of what it wrote, ros2 bag "
+    "reindex FOLDER the metadata.yaml."
+)
+
+
+class Message(NamedTuple):
+    """A message: its topic, when the recorder received it (ns since 1970), its bytes, and what rosbags made of them."""
+
+    topic: Topic
+    received: int
+    data: bytes
+    content: Any
 
 
 class Bag:
-    """A recording, whose messages are read from its files whenever they are asked for.
+    """A recording, whose messages are read from its files by ``rosbags`` whenever they are asked for.
 
     Attributes:
         path: the folder or the file.
-        remarks: what of it is missing or could not be read, sentences; complete once all messages were asked for.
+        topics: how many messages each has; complete once messages were asked for, as all that follows.
+        remarks: what of it is missing or could not be read, sentences.
 
     Raises:
         DataError: it is none.
@@ -186,51 +139,54 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.topics = Counter[Topic]()
         self.remarks: list[str] = []
-        self._files = [_KINDS[file.suffix](file) for file in self._found()]
+        self._files: list[Path] = []
+        self._parts = self._found()
 
-    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[RawMessage]:
-        """All messages in the order of the files; those that are not chosen have no data.
-
-        Raises:
-            DataError: a file is no recording.
-        """
-        for file in self._files:
-            for message in file.messages(is_read):
-                data = message.data
-                # a message of CDR begins with a zero; recorders may compress each message by itself
-                if data is not None and bytes(data[:4]) == _ZSTD:
-                    message = message._replace(data=decompressed(data, "zstd").getvalue())
-                yield message
-            for fault in file.faults:
-                self._remark(f"{file.path.name}: {fault}.")
-
-    def decoded(self, is_read: Callable[[Topic], bool]) -> Iterator[tuple[RawMessage, Any]]:
-        """As ``messages``, with those that are chosen as objects of rosbags; None for the others.
+    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[Message]:
+        """The messages of chosen topics, of each file by their time.
 
         Raises:
-            DataError: a file is no recording.
+            DataError: a file is no recording, or nothing of it can be read.
             PluginError: rosbags is not there.
         """
-        types, unread = message_types(), Counter[Topic]()
-        for message in self.messages(is_read):
-            content = None
-            if message.data is not None:
-                try:
-                    content = types.deserialize_cdr(message.data, message.topic.type)
-                except Exception:  # damaged bytes or a type that is not standard: rosbags has no one error for it
-                    unread[message.topic] += 1
+        rosbag2, typesys = (library(f"rosbags.{name}", _PURPOSE) for name in ("rosbag2", "typesys"))
+        types, unread, parts, count = typesys.get_typestore(typesys.Stores.LATEST), Counter[Topic](), [*self._parts], 0
+        self.topics.clear()
+        while parts:
+            part = parts.pop(0)
+            try:
+                with rosbag2.Reader(part) as reader:
+                    topics = {one.id: Topic(one.topic, one.msgtype) for one in reader.connections}
+                    self.topics.update({topics[one.id]: one.msgcount for one in reader.connections})
+                    chosen = [one for one in reader.connections if is_read(topics[one.id])]
+                    for connection, received, data in reader.messages(chosen) if chosen else ():
+                        count += 1
+                        try:
+                            content = types.deserialize_cdr(data, connection.msgtype)
+                        except Exception:  # damaged bytes or a type that is not standard
+                            unread[topics[connection.id]] += 1
+                            continue
+                        yield Message(topics[connection.id], received, bytes(data), content)
+            except Exception as fault:  # of damaged files rosbags has no one error
+                if part.is_dir() and not count and self._files:
+                    self._remark(f"{_METADATA} cannot be used ({said(fault)}): files are read one by one.")
+                    parts = [*self._files]
                     continue
-            yield message, content
-        for topic, count in unread.items():
-            self._remark(f"{count} messages of {topic.name} ({topic.type}) could not be decoded: left out.")
+                text = f"it is cut off, damaged or no recording ({said(fault)})"
+                if not self.topics and not parts:
+                    refuse(part, f"{text}.", f"{_EXPECTED} {_RECOVER}")
+                self._remark(f"{part.name}: {text}; {count} messages were read. {_RECOVER}")
+        for topic, lost in unread.items():
+            self._remark(f"{lost} messages of {topic.name} ({topic.type}) could not be decoded: left out.")
 
     def _remark(self, text: str) -> None:
         if text not in self.remarks:
             self.remarks.append(text)
 
     def _found(self) -> list[Path]:
-        """The files in their order: that of metadata.yaml, else that of the numbers in their names."""
+        """The folder, whose metadata.yaml names its files; without one, these in the order of their numbers."""
         if not self.path.is_dir():
             if not self.path.exists():
                 refuse(self.path, "there is no such file or folder.", "Check the spelling and the directory.")
@@ -243,27 +199,16 @@ class Bag:
             parts = re.split(r"(\d+)", path.name)
             return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
-        there = sorted((file for file in self.path.iterdir() if file.suffix in _KINDS), key=natural)
-        listed = self._listed()
-        missing = [name for name in listed if not (self.path / name).exists()]
-        if missing:
-            self.remarks.append(f"{_METADATA} lists {missing[0]}, which is not there ({len(missing)} such files).")
-        if not there:
-            packed = any(file.suffix == ".zstd" for file in self.path.iterdir())
-            hint = "Decompress its files: zstd -d --rm *.zstd" if packed else _EXPECTED
-            refuse(self.path, "found no file .mcap or .db3 in it.", hint)
-        order = {name: place for place, name in enumerate(listed)}
-        return sorted(there, key=lambda file: order.get(file.name, len(order)))
-
-    def _listed(self) -> list[str]:
-        path = self.path / _METADATA
-        if not path.exists():
-            self.remarks.append(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
-            return []
-        try:
-            content = yaml.safe_load(input_bytes(path, 1 << 24, "what a recorder wrote"))
-            names = content["rosbag2_bagfile_information"]["relative_file_paths"]
-            return [Path(str(name)).name for name in names]
-        except (yaml.YAMLError, KeyError, TypeError, ValueError):
-            self.remarks.append(f"{_METADATA} is damaged: files are taken in the order of their names.")
-            return []
+        self._files = sorted((file for file in self.path.iterdir() if file.suffix in _KINDS), key=natural)
+        for journal in self.path.glob("*.db3-wal"):
+            if journal.stat().st_size:
+                self._remark(
+                    f"{journal.name} holds messages that are not read: its recorder was killed. To have them, run "
+                    f"sqlite3 {journal.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'."
+                )
+        if (self.path / _METADATA).exists():
+            return [self.path]
+        if not self._files:
+            refuse(self.path, f"found no {_METADATA} and no file .mcap or .db3 in it.", _EXPECTED)
+        self._remark(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
+        return self._files

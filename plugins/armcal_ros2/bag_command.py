@@ -7,8 +7,7 @@ import click
 import yaml
 from armcal.cli.common import FILE, Console, speaking
 
-from armcal_ros2.bag import Bag
-from armcal_ros2.message import IMAGES
+from armcal_ros2.bag import IMAGES, Bag
 
 
 @click.group()
@@ -26,9 +25,9 @@ def info(console: Console, path: Path) -> None:
     content = survey(Bag(path))
     data = content.data(path)
     console.result({**content.content(), "data": data})
-    begin = min((topic.first for topic in content.topics.values()), default=0.0)
+    begin = min((topic.first for topic in content.topics.values() if topic.first is not None), default=0.0)
     rows = (
-        (name, topic.type, topic.count, f"{topic.first - begin:.1f}", f"{topic.last - begin:.1f}")
+        (name, topic.type, topic.count, *("" if t is None else f"{t - begin:.1f}" for t in (topic.first, topic.last)))
         for name, topic in content.topics.items()
     )
     console.table("Topics", ("topic", "type", "messages", "from s", "to s"), rows, left=("type",))

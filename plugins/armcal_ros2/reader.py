@@ -18,9 +18,8 @@ from armcal.measure.rests import deviations_of_mean, judged, mean_pose
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from armcal_ros2.bag import Bag
+from armcal_ros2.bag import JOINT_STATE, Bag, Topic
 from armcal_ros2.clock import estimated_offset
-from armcal_ros2.message import JOINT_STATE, Topic
 from armcal_ros2.samples import (
     GUARD_S,
     MEASURED,
@@ -170,22 +169,20 @@ class Rosbag2Reader:
 
     def _follow(self, bag: Bag, logs: Sequence[MeasuredLog], joints: JointLog | None = None) -> None:
         """Once through the recording; each message goes to those that read its topic."""
-        s, types = self._settings, dict[str, str]()
+        s = self._settings
 
         def is_read(topic: Topic) -> bool:
-            types[topic.name] = topic.type
             is_joints = joints is not None and topic.type == JOINT_STATE and s.joints.topic in (None, topic.name)
             return is_joints or any(log.reads(topic) for log in logs)
 
-        for (topic, received, data), message in bag.decoded(is_read):
-            if message is None:
-                continue
-            self._digest.update(data or b"")
+        for topic, received, data, content in bag.messages(is_read):
+            self._digest.update(data)
             if joints is not None and topic.type == JOINT_STATE:
-                joints.add(topic.name, message, received)
+                joints.add(topic.name, content, received)
             for log in logs:
                 if log.reads(topic):
-                    log.add(topic, message, received)
+                    log.add(topic, content, received)
+        types = {topic.name: topic.type for topic in bag.topics}
         for log in logs:
             self._require(log, types)
 

@@ -19,8 +19,7 @@ from armcal.measure.rests import LiveRests, Rows, StillSettings
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from armcal_ros2.bag import Stamps, TopicSettings, nanoseconds
-from armcal_ros2.message import Topic
+from armcal_ros2.bag import Stamps, Topic, TopicSettings, nanoseconds
 
 GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
 _BLOCK = 1000

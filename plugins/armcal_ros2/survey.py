@@ -14,8 +14,7 @@ from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse, require_new, write_new
 from numpy.typing import NDArray
 
-from armcal_ros2.bag import Bag, Stamps, nanoseconds
-from armcal_ros2.message import CAMERA_INFO, IMAGES, JOINT_STATE
+from armcal_ros2.bag import CAMERA_INFO, IMAGES, JOINT_STATE, Bag, Stamps, nanoseconds
 from armcal_ros2.samples import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
 
 _MOST_FRAMES = 200
@@ -24,14 +23,15 @@ _LATEST = 20  # So many stamps of joint states are kept: transforms that are com
 
 @dataclass
 class TopicSummary:
-    """A topic: its type, messages, first and last receipt (s since 1970), and frames (of transforms ``a -> b``).
+    """A topic: its type, messages, and frames (of transforms ``a -> b``).
 
+    ``first`` and ``last`` are when its messages were received (s since 1970), of topics that calibrate.
     ``computed`` counts transforms, by frame, with the very stamp of a joint state: robot_state_publisher's.
     """
 
     type: str
-    first: float
-    last: float = 0.0
+    first: float | None = None
+    last: float | None = None
     count: int = 0
     frames: dict[str, int] = field(default_factory=dict)
     computed: Counter[str] = field(default_factory=Counter)
@@ -86,11 +86,11 @@ def survey(bag: Bag) -> Survey:
     """
     topics, joints, remarks = dict[str, TopicSummary](), dict[str, JointLog](), list[str]()
     stamps = deque[int](maxlen=_LATEST)
-    for (topic, received, _), message in bag.decoded(lambda topic: topic.type in (JOINT_STATE, *MEASURED)):
+    for topic, received, _, message in bag.messages(lambda topic: topic.type in (JOINT_STATE, *MEASURED)):
         time = received / 1e9
         own = topics.setdefault(topic.name, TopicSummary(topic.type, time))
-        own.count, own.last, own.first = own.count + 1, max(own.last, time), min(own.first, time)
-        if message is None or (topic.type == JOINT_STATE and not message.name):
+        own.last, own.first = max(own.last or time, time), min(own.first or time, time)
+        if topic.type == JOINT_STATE and not message.name:
             continue
         if topic.type == JOINT_STATE:
             if topic.name not in joints:
@@ -106,7 +106,9 @@ def survey(bag: Bag) -> Survey:
                 own.frames[frame] = own.frames.get(frame, 0) + 1
                 if child and nanoseconds(part.header.stamp) in stamps:
                     own.computed[frame] += 1
-    if not topics:
+    for topic, count in bag.topics.items():
+        topics.setdefault(topic.name, TopicSummary(topic.type)).count += count
+    if not any(own.count for own in topics.values()):
         hint = "Record again, or give another recording."
         raise DataError(
             "found no message in it.", where=Location(str(bag.path)), hint=f"{' '.join(bag.remarks)} {hint}"
@@ -209,11 +211,7 @@ def _nearest(
     begins, settle = [rest.begin for rest in rests], RestSettings().settle
     above = topic.removesuffix("/compressed").rpartition("/")[0]
     held: tuple[int, float, Any] | None = None
-    for (own, received, _), message in bag.decoded(
-        lambda read: read.name == topic or (read.name == f"{above}/camera_info" and not infos)
-    ):
-        if message is None:
-            continue
+    for own, received, _, message in bag.messages(lambda read: read.name in (topic, f"{above}/camera_info")):
         if own.type == CAMERA_INFO:
             infos.append(message)
             continue

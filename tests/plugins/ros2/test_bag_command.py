@@ -14,7 +14,6 @@ import yaml
 from armcal.errors import DataError, InputError, PluginError
 from armcal.run.experiment import Experiment
 from armcal_ros2.bag_command import bag as command
-from armcal_ros2.message import message_types
 from click.testing import CliRunner
 
 
@@ -146,7 +145,6 @@ def test_compressed_images_are_kept_as_they_are(tour: bags.Tour) -> None:
 
 def test_without_rosbags_one_sentence_says_what_to_install(tour: bags.Tour, monkeypatch: pytest.MonkeyPatch) -> None:
     path = bags.write_bag(tour.config.with_name("unread"), tour.sent()[:5])
-    message_types.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(PluginError, match=r"needs the library rosbags.*pip install 'armcal\[ros2\]'"):
         CliRunner().invoke(command, ["info", str(path)], catch_exceptions=False)
