@@ -80,17 +80,22 @@ def find(
 def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
     """Ids that answer at the bus's baud rate, or from which something comes.
 
-    Feetech servos that are asked all at once may talk all at once: what they say then is only a hint.
+    Feetech servos that are asked all at once may talk all at once: what they say then is only a hint. Where any
+    answers, those that are silent are asked once more: a packet is lost now and then.
     """
     hints = {answer.id for answer in bus.probe(BROADCAST, _BROADCAST_S).answers}
-    there = []
-    for servo in sorted({*ids, *hints}):
-        heard = bus.probe(servo, _ONE_S)
-        if heard.damaged and not heard.answers:  # noise is not there again
+    silent, there = sorted({*ids, *hints}), list[int]()
+    for _ in range(2):
+        for servo in silent:
             heard = bus.probe(servo, _ONE_S)
-        if heard.damaged or servo in {answer.id for answer in heard.answers}:
-            there.append(servo)
-    return there
+            if heard.damaged and not heard.answers:  # noise is not there again
+                heard = bus.probe(servo, _ONE_S)
+            if heard.damaged or servo in {answer.id for answer in heard.answers}:
+                there.append(servo)
+        silent = [servo for servo in silent if servo not in there]
+        if not there:
+            break
+    return sorted(there)
 
 
 def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo:

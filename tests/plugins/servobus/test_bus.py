@@ -133,6 +133,22 @@ def test_all_servos_are_found():
         bus.close()
 
 
+def test_a_servo_whose_answer_was_lost_is_asked_again():
+    with FakeBus([sts(1), sts(2)]) as fake:
+        lost = []
+
+        def mangle(answer):
+            if answer[2] == 2 and len(lost) < 2:  # of the ping of all, and of its own
+                lost.append(answer)
+                return b""
+            return answer
+
+        fake.mangle = mangle
+        bus = opened(fake)
+        assert [servo.id for servo in find(bus, (1_000_000,), range(4))] == [1, 2] and len(lost) == 2
+        bus.close()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", [0, 2])
 def test_two_servos_with_one_id_are_seen(protocol):
