@@ -45,9 +45,7 @@ class Run:
         settings, clock, device = self.settings, self.clock, self.device
         planner = PathPlanner(None, np.array([[-2.0, 2.0]] * 2), self.poses, 0.02)
         drive = Drive(device, clock, planner, settings, self.model, self.log)
-        scheduler = Scheduler(
-            self.poses, IDS, 0 * self.poses, drive.park, planner, self.model, RATE, 2.0, settings.order
-        )
+        scheduler = Scheduler(self.poses, IDS, 0 * self.poses, drive.park, planner, self.model, RATE, 2.0)
         gate = MotionGate(self.monitor, clock, settings.lost, lambda: self.asked)
         identity = device.open(clock)
         return AcquisitionRun(drive, identity, scheduler, gate, self.log, NoEvidence(), lambda progress: None)

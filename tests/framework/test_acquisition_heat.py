@@ -23,12 +23,12 @@ def torques(pose: np.ndarray) -> np.ndarray:
 HEAT = HeatModel.of(JOINTS, {"q2": ServoHeatSettings.si(continuous=1.0, case_time=600.0, budget=0.6)}, torques)
 
 
-def scheduler(poses: np.ndarray, order: str = "plan", model: HeatModel = HEAT, check=None) -> Scheduler:
+def scheduler(poses: np.ndarray, model: HeatModel = HEAT, check=None) -> Scheduler:
     limits = np.array([[-np.pi, np.pi]] * 2)
     park = np.zeros(2)
     planner = PathPlanner(check, limits, np.vstack([park, poses]), 0.02)
     names = tuple(f"p{i}" for i in range(len(poses)))
-    return Scheduler(poses, names, 0 * poses, park, planner, model, np.deg2rad(20), 8.0, order)
+    return Scheduler(poses, names, 0 * poses, park, planner, model, np.deg2rad(20), 8.0)
 
 
 def test_heat_follows_its_differential_equations() -> None:
@@ -82,19 +82,6 @@ def test_a_pose_that_no_servo_bears_is_left_out_and_the_others_are_not() -> None
     left = [step for step in forecast.steps if isinstance(step, LeaveOut)]
     assert [step.pose for step in left] == [1] and "even from cold" in left[0].why
     assert sorted(step.pose for step in forecast.steps if isinstance(step, Measure)) == [0, 2]
-
-
-def test_a_cool_order_takes_no_longer_than_the_plans() -> None:
-    random = np.random.default_rng(3)
-    poses = random.uniform([-2, -1.5], [2, 1.5], (40, 2))
-    times = {
-        order: forecast_schedule(scheduler(poses, order), np.zeros(2), HEAT.cold, list(range(40)))
-        for order in ("plan", "cool")
-    }
-    assert times["cool"].seconds < times["plan"].seconds
-    assert times["cool"].hottest[1] <= 0.6
-    for forecast in times.values():
-        assert sorted(step.pose for step in forecast.steps if isinstance(step, Measure)) == list(range(40))
 
 
 def test_each_step_begins_where_the_one_before_ended() -> None:

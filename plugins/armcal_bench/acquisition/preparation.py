@@ -82,7 +82,6 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         model=heat,
         rate=float(np.deg2rad(settings.rate_deg_per_s)),
         capture=settings.settle.wait + settings.settle.window + 0.5,
-        order=settings.order,
     )
     judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)

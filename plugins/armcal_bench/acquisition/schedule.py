@@ -1,9 +1,8 @@
-"""Which pose comes next, and when the servos have to rest first."""
+"""The poses of a plan one after another, and when the servos have to rest first."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeGuard
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -12,7 +11,6 @@ from armcal_bench.acquisition.drive import JointPath, PathPlanner, travel
 from armcal_bench.acquisition.heat import COOLED_TO, NEVER, HeatModel
 
 _SAMPLES = 8
-_CONSIDERED = 12
 
 
 @dataclass(frozen=True)
@@ -61,24 +59,11 @@ class Scheduler:
     model: HeatModel
     rate: float  # of the fastest joint, rad/s
     capture: float  # how long it is expected to stand in a pose, s
-    order: str  # ``plan``, or ``cool`` (the pose that costs least time, cooling included)
 
     def next(self, at: Array, thermal_state: Array, left: Sequence[int]) -> Next:
         """What to do now; ``left`` are indices of poses, in the plan's order, at least one."""
-        candidates = left[:1]
-        if self.order == "cool":
-            away = np.max(np.abs(self.poses[list(left)] - at), axis=1)
-            candidates = [left[i] for i in np.argsort(away, kind="stable")[:_CONSIDERED]]
-
-        def cost(step: Measure) -> float:
-            warmed = np.maximum(self.model.shares * (step.thermal_state - thermal_state), 0.0)
-            return step.seconds + float(np.max((warmed / self.model.budget[:, None] * self.model.times).sum(axis=1)))
-
-        steps = [self._measured(at, thermal_state, pose) for pose in candidates]
-        fitting = [step for step in steps if self._fits(step)]
-        if fitting:
-            return min(fitting, key=cost)
-        return steps[0] if isinstance(steps[0], LeaveOut) else self._rested(at, thermal_state, candidates[0])
+        step = self._measured(at, thermal_state, left[0])
+        return step if isinstance(step, LeaveOut) or self._fits(step) else self._rested(at, thermal_state, left[0])
 
     def _measured(self, at: Array, thermal_state: Array, pose: int) -> Measure | LeaveOut:
         path = self.planner.find(at, self.poses[pose])
@@ -88,7 +73,7 @@ class Scheduler:
         after = self.model.after(there, self.model.torques(self.poses[pose]), self.capture)
         return Measure(pose, path, travel(path) / self.rate + self.capture, np.maximum(there, after))
 
-    def _fits(self, step: Measure | LeaveOut) -> TypeGuard[Measure]:
+    def _fits(self, step: Measure | LeaveOut) -> bool:
         """Within the budget there, and on the path to where it rests."""
         if isinstance(step, LeaveOut) or self.model.over(step.thermal_state):
             return False

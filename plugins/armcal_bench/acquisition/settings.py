@@ -58,11 +58,11 @@ class AcquisitionSettings(Settings):
 
     ``limits`` of joints are those of ``plan`` where none are given here. ``park`` is where the arm is safe, cool and
     stays when it is left alone; joints that it does not name park at zero. Without ``heat`` no heat is reckoned with.
-    ``order`` is the plan's, or ``cool``: the next pose is then the one that the servos can best bear. The board waits
-    for ``silence`` of the host before it parks the arm by itself, where its link can. At the end the arm parks, and its
-    servos are let go one by one, or hold. Joints get their first pulses one by one, ``between_joints`` apart.
-    ``temperature`` is that of the room, where it is known; it is written with the data. ``angles`` are those that the
-    dataset has: as commanded, or as servos that know where they stand have measured them; the others stand beside them.
+    The board waits for ``silence`` of the host before it parks the arm by itself, where its link can. At the end the
+    arm parks, and its servos are let go one by one, or hold. Joints get their first pulses one by one,
+    ``between_joints`` apart. ``temperature`` is that of the room, where it is known; it is written with the data.
+    ``angles`` are those that the dataset has: as commanded, or as servos that know where they stand have measured them;
+    the others stand beside them.
     """
 
     rate_deg_per_s: Annotated[float, Field(gt=0, le=180)] = 20.0
@@ -74,7 +74,6 @@ class AcquisitionSettings(Settings):
     arrival: ArrivalSettings = Field(default_factory=ArrivalSettings)
     lost: LostSettings = Field(default_factory=LostSettings)
     heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)
-    order: Literal["plan", "cool"] = "plan"
     silence: Duration = 1.0
     at_end: Literal["release", "hold"] = "release"
     between_joints: Duration = 0.5
