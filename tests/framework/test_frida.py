@@ -15,6 +15,7 @@ import pytest
 import two_arms
 import yaml
 from armcal.cli.main import cli
+from armcal.config.selection import with_values
 from click.testing import CliRunner
 from two_arms import Case, offsets_of
 
@@ -120,8 +121,9 @@ def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
     parameters = told["parameters"]
     held, determined = ({n for n, p in kept.items() if p["determined_by"] == by} for by in ("prior", "data"))
     assert held | determined == set(kept)
-    if all("axis" not in n for n in kept):
-        assert parameters["determined_by"] == {n: p["determined_by"] for n, p in kept.items()}
+    # The file has entries, of rotations and axes more than they have coordinates.
+    numbers = {n: by for n, by in parameters["determined_by"].items() if n in kept}
+    assert numbers == {n: kept[n]["determined_by"] for n in numbers}
     by_data = list(parameters["determined_by"].values()).count("data")
     assert parameters["free"] - parameters["rank"] == len(parameters["undetermined"]) <= parameters["free"] - by_data
     (text,) = (f["text"] for f in told["verdict"]["findings"] if f["text"].startswith("The data determines"))
@@ -140,6 +142,15 @@ def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
         assert kept[n]["lower"] < kept[n]["upper"] < kept[n]["lower"] + 0.01, n
     off = [abs(kept[n]["value"] - two_arms.number(truth[n])) / kept[n]["sd"] for n in determined & set(truth)]
     assert all(x < 4.5 for x in off)
+
+
+def test_entries_of_an_axis_are_plain_numbers_in_si_or_have_a_unit():
+    parameters = Case.load("dual_twists").experiment.parameters
+    plain, stated = (
+        with_values(parameters, {"left.poe.axis1[vx]": text}, None, ()).nominal() for text in (-0.0049, "-4.9 mm")
+    )
+    np.testing.assert_allclose(plain, stated, rtol=1e-12)
+    assert not np.array_equal(plain, parameters.nominal())
 
 
 # ---------------------------------------------------------------- gauge dimensions

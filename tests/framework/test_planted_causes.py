@@ -62,7 +62,7 @@ def test_no_drift_is_advised_for_a_function_of_the_pose_along_a_path(tmp_path: P
     found = left(base, cause, recording(base, cause, 0, along_a_path(0)))
     assert found.shows and found.in_order
     text = said(found)
-    assert "parameters.drift" not in text and "do not identify which" in text
+    assert "parameters.drift" not in text and "do not show whether the pose or time is the cause" in text
     assert "Repeat some of the first poses at the end" in text and "Learn it" not in text
 
 

@@ -84,7 +84,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
         assert solution.verdict.converged
         intervals = estimate(problem, solution).intervals
         held.append([i.lower <= x <= i.upper for i, x in zip(intervals, expected, strict=True)])
-        one_sided.append([i.bound is not None for i in intervals])
+        one_sided.append([bool(i.bounds) for i in intervals])
     share = np.mean(held, axis=0)
     near = np.mean(one_sided, axis=0) > 0
     names = np.array(loaded.parameters.coordinate_names)

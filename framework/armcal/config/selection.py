@@ -141,7 +141,9 @@ def with_values(
             )
         numbers = list(block.nominal)
         i = block.entry_names.index(name)
-        numbers[i] = quantity(replace(block, unit=block.entry_units[i]), text, source, place)
+        is_plain = not isinstance(text, str) and DIMENSION_OF_UNIT.get(block.unit) in (None, DIMENSIONLESS)
+        unit = block.unit if is_plain else block.entry_units[i]  # entries of an axis may be plain numbers, in SI
+        numbers[i] = quantity(replace(block, unit=unit), text, source, place)
         parameters = parameters.replaced({owner: replace(block, nominal=tuple(numbers))})
         changed[owner] = place
     for owner, place in changed.items():

@@ -43,7 +43,8 @@ from armcal.measure.groups import PairedMeasurement, pose_numbers
 from armcal.problem.problem import Problem
 
 LEVEL = 0.01
-_NEAR = 0.05  # Of rivals of a cause that is significant: beyond this level one is none
+_NEAR, _FAR_LESS = 0.05, 0.9
+"""Of rivals of a cause that is significant: beyond this level one is none, and what it leaves is so much less."""
 """Of everything that is tried together: so often something is said of sound data."""
 CLEAR = 3.0  # Logarithm of the odds, 20 to 1, from which on one explanation is preferred
 FEWEST_RECORDS = 30
@@ -68,6 +69,7 @@ _NEGLIGIBLE = 0.1  # Of what causes take up: less than this may be what is not l
 _NEXT_CARRIER = 0.1  # Of the whole share: what predicts less beside the ones before it is not named
 _BEYOND = 0.05  # Level at which what a cause leaves is more than noise
 _LIKELIER = 0.5  # Where chance has more of the odds, a cause is none
+_HOPELESS = 0.01  # A cause with less of the odds is none
 _LACK, _TIMES_REPEATS, _FEWEST_REPEATS = 0.005, 3.0, 5
 _LEAST_LEFT = 0.05  # Of a row, of what a fit takes up most
 _MM = 1000.0
@@ -359,6 +361,8 @@ class Contest:
         chosen, first, last = self._search()
         worth = (1 - max(last.lag, 0.0)) / (1 + max(last.lag, 0.0))
         settled = self._settled(chosen, worth)
+        if len(settled) < len(chosen):
+            last = self._tried_well([*settled])
         structures = {i: self._structure(i, [j for j in settled if j != i], modelled, *of) for i, of in settled.items()}
         residual, basis = self.beside(list(structures))
         rest = self._predicted(residual, basis) if min(last.lag_p, last.smooth_p) <= LEVEL else None
@@ -401,25 +405,32 @@ class Contest:
 
     def _search(self) -> tuple[dict[int, float], Tried, Tried]:
         """Causes one after another as long as one is significant, with p-values; the first trial and the last."""
-        first = tried = self._tried([], FEWER_DRAWS)
-        if 1 / (1 + FEWER_DRAWS) < tried.least <= _OUT_OF_QUESTION:
-            first = tried = self._tried([], DRAWS)
+        first = tried = self._tried_well([])
         chosen, whole = dict[int, float](), float(self.residual @ self.residual)
         now = whole
         while len(chosen) < _MOST_CAUSES and np.any(tried.p_values <= LEVEL):
-            # The least Bayesian information criterion, blocks counting as one: a cause of many numbers may fit far
-            # better than the one that its few numbers make significant.
-            near = np.flatnonzero(tried.p_values <= _NEAR)
-            sizes = np.array([own.shape[1] for _, own in tried.left])[near]
+            # The least Bayesian information criterion, blocks counting as one.
+            sizes, unexplained = np.array([own.shape[1] for _, own in tried.left]), np.maximum(1 - tried.shares, 1e-12)
             count = self.blocks * self.rows.by_record.shape[1]
-            unexplained = np.maximum(1 - tried.shares[near], 1e-12)
-            best = int(near[np.argmin(count * np.log(unexplained) + sizes * np.log(count))])
+            criterion = count * np.log(unexplained) + sizes * np.log(count)
+            best = int(np.argmin(np.where(tried.p_values <= LEVEL, criterion, np.inf)))
+            # A cause of many numbers may fit far better than the one that its few numbers make significant.
+            rivals = (tried.p_values <= _NEAR) & (unexplained < _FAR_LESS * unexplained[best])
+            best = int(np.argmin(np.where(rivals, criterion, np.inf))) if rivals.any() else best
             if tried.shares[best] * now < _NEGLIGIBLE * (whole - now):
                 break
             now *= 1 - float(tried.shares[best])
             chosen[tried.left[best][0]] = float(tried.p_values.min())
-            tried = self._tried(list(chosen), FEWER_DRAWS)
+            tried = self._tried_well(list(chosen))
         return chosen, first, tried
+
+    def _tried_well(self, others: Sequence[int]) -> Tried:
+        """By few draws, and by all where these leave the level of anything, or of a cause, in doubt."""
+        tried = self._tried(others, FEWER_DRAWS)
+        doubtful = (tried.least, tried.p_values.min(initial=1.0))
+        if any(1 / (1 + FEWER_DRAWS) < p <= _OUT_OF_QUESTION for p in doubtful):
+            return self._tried(others, DRAWS)
+        return tried
 
     def _tried(self, others: Sequence[int], draws: int) -> Tried:
         residual, basis = self.beside(others)
@@ -569,7 +580,9 @@ class Contest:
         )
 
     def _settled(self, chosen: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
-        """Causes with p-values and odds, each beside the others: the likeliest in its place, none that chance beats.
+        """Causes with p-values and odds, each beside the others: the likeliest in its place.
+
+        None that chance beats, and none with less than 1 % of the odds: what then is left is none of the causes.
 
         ``worth`` is how much of a record each record is, where neighbours err alike. The best of many causes is
         significant in some recordings of nothing but noise; odds say which of them are chance.
@@ -585,7 +598,10 @@ class Contest:
         odds = [self._odds(cause, [o for o in settled if o != cause], worth) for cause in settled]
         whole = {i: (p, odd) for i, p, odd in zip(settled, chosen.values(), odds, strict=True)}
         least = max(whole, key=lambda i: whole[i][1].chance, default=None)
-        if least is None or whole[least][1].chance <= _LIKELIER:
+        if least is not None and whole[least][1].chance <= _LIKELIER:
+            least = min(whole, key=lambda i: whole[i][1].share)
+            least = least if whole[least][1].share < _HOPELESS else None
+        if least is None:
             return whole
         return self._settled({i: p for i, (p, _) in whole.items() if i != least}, worth)
 
