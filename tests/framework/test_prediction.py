@@ -275,7 +275,7 @@ def test_folds_err_as_they_did_before_they_were_asked_for_intervals() -> None:
     problem, splits = problem_of(loaded, dataset), folds(80, 4, 0)
     parts = (problem.of(dataset), splits, loaded.estimator, loaded.parameters.nominal())
     plain, asked = cross_validate(*parts), cross_validate(*parts, judge=fit_and_predict)
-    assert np.array_equal(plain.errors, asked.errors)
+    np.testing.assert_allclose(plain.errors, asked.errors, rtol=1e-10)  # m; residuals are summed in another order
 
 
 @pytest.fixture(scope="module")

@@ -65,6 +65,7 @@ _FOLDS = 5
 _SAME = 0.999  # Cosine from which on two causes are one
 _IMITATED = 0.1  # An explanation of which another predicts this share cannot be distinguished from it
 _IN_ORDER = 0.5  # Share of the order of records from which on poses tell the time
+_LEAST_LEFT_OVER = 0.02  # Of what a cause takes up: less is what it does beyond first order
 _NEGLIGIBLE = 0.1  # Of what causes take up: less than this may be what is not linear in them
 _NEXT_CARRIER = 0.1  # Of the whole share: what predicts less beside the ones before it is not named
 _BEYOND = 0.05  # Level at which what a cause leaves is more than noise
@@ -619,8 +620,9 @@ class Contest:
         # poses were in order.
         after, whole = self.beside([*others, cause])
         beyond = float(after @ after) - chdtri(len(after) - whole.shape[1], _BEYOND)
-        left = beyond > _NEGLIGIBLE * float(residual @ residual - after @ after)
-        left = left or Smooth.of(of_pose, whole).evidence(after) * worth > CLEAR
+        share = beyond / max(float(residual @ residual - after @ after), SMALLEST)
+        left = share > _NEGLIGIBLE
+        left = left or (share > _LEAST_LEFT_OVER and Smooth.of(of_pose, whole).evidence(after) * worth > CLEAR)
         timely = self.causes[cause].jumps or self.causes[cause].kind == "order"
         if left or (timely and of_pose[0].imitate((residual - after)[self.rows.by_record]) > _IMITATED):
             shown[UNLISTED] = max(shown[UNLISTED], shown[mine])
