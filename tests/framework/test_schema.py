@@ -35,7 +35,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "run": (
         f"run {DEMO} --out {{out}}/run --json {FAST} --set uncertainty.bootstrap=2 --set validation.folds=2"
         " --set 'uncertainty.profile=[arm.spring.k1]' --set noise.loss=reject --set validation.limit_mm=1"
-        " --set 'parameters.free=[arm.spring.k1, arm.spring.k2]' --accept",
+        " --set 'statics.gravity_m_s2=[5, 0, -8]' --accept",
     ),
     "run, noise estimated": (
         f"run {DEMO} --out {{out}}/run --json {FAST} --set noise.estimate=true --set validation.folds=0",
