@@ -198,7 +198,7 @@ def run(kind: str, seed: int, config: Path) -> Outcome:
     try:
         result = calibrate(Experiment.load(config, (), data))
     except ArmcalError as fault:
-        return Outcome(kind, seed, len(dataset), "refused", (str(fault),), time.process_time() - began)
+        return Outcome(kind, seed, len(dataset), "refused", (f"refused: {fault}",), time.process_time() - began)
     seconds = time.process_time() - began
     grades = [finding.grade for finding in result.verdict.findings]
     grade = next((own for own in ("bad", "warning") if own in grades), "good")

@@ -201,25 +201,32 @@ def checked(file: MotorFile, other: MotorFile | None, gripper: Gripper | None, u
 
 
 def bus_joints(file: MotorFile, gripper: Gripper | None, model: str) -> str:
-    """The joints of a servo bus whose angles are those of LeRobot, as a section of a configuration."""
+    """The joints of a servo bus whose angles are those of LeRobot, and limits of a plan: sections of a configuration.
+
+    A plan keeps within both the file's range and the model's, whose middle LeRobot has at zero.
+    """
     arm = gripper.name if gripper else "arm"
     wiring = gripper.wiring if gripper else {name: (name, 1) for name in file.motors if not is_gripper(name)}
-    joints = {}
+    joints, limits = {}, {}
     for joint, (name, sense) in wiring.items():
         motor, zero = file.motors[name], round(file.motors[name].middle)
         if passed := motor.passed_end(gripper.ranges_deg[name] if gripper else None):
             raise DataError(passed, where=Location(str(file.path), field=name), hint=IN_THE_MIDDLE)
         ends = sorted(sense * (count - zero) * 360 / COUNTS_A_TURN for count in (motor.range_min, motor.range_max))
+        own = [math.ceil(10 * ends[0]) / 10, math.floor(10 * ends[1]) / 10]
         joints[f"{arm}.{joint}"] = {
             "id": motor.id,
             "model": model,
             "zero_count": zero,
             "offset": motor.homing_offset,
             "direction": sense,
-            "range_deg": [math.ceil(10 * ends[0]) / 10, math.floor(10 * ends[1]) / 10],
+            "range_deg": own,
         }
+        half = min(gripper.ranges_deg[name] / 2 if gripper else 180.0, 180.0)
+        limits[joint] = [max(own[0], math.ceil(-10 * half) / 10), min(own[1], math.floor(10 * half) / 10)]
     device = {"type": "servobus", "port": "/dev/ttyACM0", "joints": joints}
-    return yaml.safe_dump({"bench": {"device": device}}, sort_keys=False, default_flow_style=None, width=120)
+    sections = {"bench": {"device": device}, "plan": {"candidates": "continuous", "limits_deg": limits}}
+    return yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=120)
 
 
 def rezeroed(file: MotorFile, zeros: Mapping[str, Zero], wiring: Mapping[str, tuple[str, int]]) -> dict[str, Motor]:

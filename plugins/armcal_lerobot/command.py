@@ -69,7 +69,7 @@ def check(console: Console, calibration: Path, other: Path | None, units: Units,
 @_of_arm
 @speaking
 def joints(console: Console, calibration: Path, model: str, **of_arm: Any) -> None:
-    """A calibration file as the joints of a servo bus: a section of a configuration."""
+    """A calibration file as sections of a configuration: the joints of a servo bus, and limits of a plan."""
     from armcal_lerobot.arm import bus_joints
 
     file = read_motors(calibration)

@@ -172,6 +172,7 @@ class Bag:
             except Exception as fault:  # of damaged files rosbags has no one error
                 if part.is_dir() and not count and self._files:
                     self._remark(f"{_METADATA} cannot be used ({said(fault)}): files are read one by one.")
+                    self.topics.clear()
                     parts = [*self._files]
                     continue
                 text = f"it is cut off, damaged or no recording ({said(fault)})"

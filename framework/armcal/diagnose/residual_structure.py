@@ -421,7 +421,7 @@ class Contest:
             if tried.shares[best] * now < _NEGLIGIBLE * (whole - now):
                 break
             now *= 1 - float(tried.shares[best])
-            chosen[tried.left[best][0]] = float(tried.p_values.min())
+            chosen[tried.left[best][0]] = float(tried.p_values.min())  # that residuals depend on any of them
             tried = self._tried_well(list(chosen))
         return chosen, first, tried
 

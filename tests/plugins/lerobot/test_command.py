@@ -88,7 +88,15 @@ def test_a_range_in_percent_stretches_the_motion(tmp_path: Path) -> None:
 def test_sections_are_a_configuration(tmp_path: Path) -> None:
     one = write_motors(tmp_path / "one.json", elbow_flex={"range_min": 1000})
     text = called("joints", one, "--arm", ARM, "--joint", "elbow_flex=-elbow_flex")
-    device = yaml.safe_load(text)["bench"]["device"]
+    sections = yaml.safe_load(text)
+    device, planned = sections["bench"]["device"], sections["plan"]["limits_deg"]
+    assert all(
+        own["range_deg"][0]
+        <= planned[name.partition(".")[2]][0]
+        < planned[name.partition(".")[2]][1]
+        <= own["range_deg"][1]
+        for name, own in device["joints"].items()
+    )  # acquire takes what plan gives
     assert discover().find("device", device.pop("type")).load().Settings.model_validate(device)
     assert device["joints"]["arm.elbow_flex"] == {
         "id": 3,
@@ -160,6 +168,8 @@ def test_sound_ranges_are_not_named(tmp_path: Path) -> None:
     assert not json_of("check", file, "--arm", config)["notes"]
     device = yaml.safe_load(called("joints", file, "--arm", config))["bench"]["device"]
     assert device["joints"][f"arm.{joints[0]}"]["range_deg"] == [-109.8, 109.8]
+    limits = yaml.safe_load(called("joints", file, "--arm", config))["plan"]["limits_deg"]
+    assert limits[joints[0]] == [-85.9, 85.9]  # the model's, 1.5 rad
 
 
 def test_a_whole_turn_is_sound_where_the_joint_turns_freely(tmp_path: Path) -> None:
