@@ -42,7 +42,8 @@ class Miss:
     record_id: str
     row: int
     error_mm: float  # its error, by a fit that did not see it where there is one
-    limit_mm: float  # its own limit
+    error_deg: float | None  # of its orientation, likewise, where one is measured beside a position
+    times: float  # how many times its own limit it is off, by all that was measured
     reasons: tuple[str, ...]  # what is unusual about it, in words
     advice: str  # what to do about it
 
@@ -97,26 +98,25 @@ def large_errors(fit: Fit) -> LargeErrors | None:
     stated, errors = fit.ready.limit_mm, fit.judged_mm
     far = fit.of(distances)
     if stated is not None:
-        limits = np.full(len(errors), stated)
+        times = errors / stated
     else:
-        beyond = np.max(far.beyond(), axis=0)
+        times = np.max(far.beyond(), axis=0)
         errors = np.where(np.isfinite(errors), errors, fit.errors.calibrated_mm)
         if fit.fitted.loss != "none":
             errors[fit.split.train] = np.nan
-        limits = errors / np.maximum(beyond, SMALLEST_SCALE)
     known = np.isfinite(errors)
     if not known.any():
         return None
-    missed = np.flatnonzero(known & (errors > limits))
-    missed = missed[np.argsort(-(errors / limits)[missed], kind="stable")]
+    missed = np.flatnonzero(known & (times > 1))
+    missed = missed[np.argsort(-times[missed], kind="stable")]
     explained: tuple[Miss, ...] = ()
     if len(missed):
         leverage = _above(np.sum(far.leverages, axis=0))
         efforts = {name: _above(np.abs(loads.efforts)) for name, loads in fit.motion.loads.items()}
         residuals = fit.few.residuals(fit.estimate.values)
         farthest = missed[:MOST_EXPLAINED]
-        explained = tuple(_miss(fit, int(i), errors[i], limits[i], residuals, leverage, efforts) for i in farthest)
-    limit = float(np.median(limits[known]))
+        explained = tuple(_miss(fit, int(i), errors[i], times[i], residuals, leverage, efforts) for i in farthest)
+    limit = float(np.median((errors / np.maximum(times, SMALLEST_SCALE))[known])) if stated is None else stated
     return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), explained)
 
 
@@ -124,7 +124,7 @@ def _miss(
     fit: Fit,
     record: int,
     error_mm: float,
-    limit_mm: float,
+    times: float,
     residuals: Sequence[Array],
     leverage: Array,
     efforts: Mapping[str, Array],
@@ -149,8 +149,10 @@ def _miss(
     elif far or heavy:
         advice = "measure more poses like it"
     unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
-    row = dataset.rows[record] if dataset.rows else 0
-    return Miss(dataset.ids[record], row, float(error_mm), float(limit_mm), unusual, advice)
+    row, turns = dataset.rows[record] if dataset.rows else 0, fit.errors.turns
+    judged = None if turns is None else (turns.cross_validated_deg[record], turns.calibrated_deg[record])
+    turned = None if judged is None else float(judged[0] if np.isfinite(judged[0]) else judged[1])
+    return Miss(dataset.ids[record], row, float(error_mm), turned, float(times), unusual, advice)
 
 
 def _above(numbers: Array) -> Array:
@@ -273,17 +275,18 @@ def outlying(fit: Fit) -> list[Finding]:
         text = f"{count} {what}, the worst {listed}. So many are no outliers: {_TOO_MANY}."
         action = "Look in residuals.csv at what they have in common, and state their noise if it is known."
         return [*findings, Finding("warning", text, test, action)]
-    own = (
-        f"{readable(m.error_mm)} {unit}" + ("" if beyond.configured else f", limit {readable(m.limit_mm)}")
-        for m in first
-    )
-    listed = "; ".join(f"{m.record_id} ({size}: {', '.join(m.reasons)})" for m, size in zip(first, own, strict=True))
+    listed = "; ".join(f"{miss.record_id} ({_size(miss, beyond, unit)}: {', '.join(miss.reasons)})" for miss in first)
     more = f"; and {beyond.beyond - MOST_TOLD} more, in the report" if beyond.beyond > MOST_TOLD else ""
     advice = "; or ".join(dict.fromkeys(miss.advice for miss in first))
     advice = f"{advice.capitalize()}."
     if {miss.record_id for miss in first} & set(fit.trained_on):
         advice += " Or set noise.loss: reject, which sets such records aside."
     return [*findings, Finding("warning", f"{count} {what}: {listed}{more}.", test, advice)]
+
+
+def _size(miss: Miss, beyond: LargeErrors, unit: str) -> str:
+    turned = "" if miss.error_deg is None else f" and {readable(miss.error_deg)} deg"
+    return f"{readable(miss.error_mm)} {unit}{turned}" + ("" if beyond.configured else f", {miss.times:.1f} times its limit")
 
 
 LEAST_SHARE = 0.1  # Of the records: fewer than these are outliers, which the other tests name one by one
