@@ -371,7 +371,7 @@ def large_errors_of(lrm, spoil, limit=None):
     dataset = replace(dataset, channels=columns)
     problem = problem.of(dataset)
     errors = 1000 * np.linalg.norm(problem.residuals(found.values)[0], axis=0)
-    known = {"judged_mm": errors, "errors": SimpleNamespace(calibrated_mm=errors)}
+    known = {"judged_mm": errors, "errors": SimpleNamespace(calibrated_mm=errors, turns=None)}
     return large_errors(fit_of(problem, found, dataset, limit_mm=limit, **known))
 
 

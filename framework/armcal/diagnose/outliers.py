@@ -286,7 +286,8 @@ def outlying(fit: Fit) -> list[Finding]:
 
 def _size(miss: Miss, beyond: LargeErrors, unit: str) -> str:
     turned = "" if miss.error_deg is None else f" and {readable(miss.error_deg)} deg"
-    return f"{readable(miss.error_mm)} {unit}{turned}" + ("" if beyond.configured else f", {miss.times:.1f} times its limit")
+    times = "" if beyond.configured else f", {miss.times:.1f} times its limit"
+    return f"{readable(miss.error_mm)} {unit}{turned}{times}"
 
 
 LEAST_SHARE = 0.1  # Of the records: fewer than these are outliers, which the other tests name one by one
