@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal.errors import NotConvergedError, ProblemError
+from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.estimate.uncertainty import (
@@ -21,7 +20,6 @@ from armcal.estimate.uncertainty import (
     standard_error_of_mean,
 )
 from armcal.io.parallel import Workers
-from armcal.problem.records import Correlation
 from armcal.run.study import Change, change, simplest_good
 from click.testing import CliRunner
 
@@ -139,15 +137,13 @@ def _white(random: np.random.Generator, count: int) -> np.ndarray:
     return random.normal(size=count)
 
 
-@pytest.mark.parametrize(
-    "method, blocks, low, high", [("blocks", 1, 0.8, 1.25), ("blocks", "auto", 0.6, 1.4), ("parametric", 1, 0.8, 1.25)]
-)
+@pytest.mark.parametrize("blocks, low, high", [(1, 0.8, 1.25), ("auto", 0.6, 1.4)])
 @pytest.mark.slow
 def test_where_the_model_is_true_the_bootstrap_agrees_with_the_curvature(
-    lrm, method: str, blocks: object, low: float, high: float
+    lrm, blocks: object, low: float, high: float
 ) -> None:
     """Blocks leave fewer draws, so that their spread scatters more."""
-    settings = BootstrapSettings(bootstrap=100, method=method, blocks=blocks)
+    settings = BootstrapSettings(bootstrap=100, blocks=blocks)
     _, spread, curvature = _experiments(lrm, _white, 2, settings)
     assert np.all((spread / curvature > low) & (spread / curvature < high))
 
@@ -183,17 +179,15 @@ def _fitted(lrm, *overrides):
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_refits_anywhere(lrm) -> None:
     experiment, problem, records, found = _fitted(lrm)
-    for method in ("blocks", "parametric"):
-        settings = BootstrapSettings(bootstrap=6, method=method, seed=5)
-        runs = [
-            bootstrap(problem.with_records(records), experiment.estimator, found, settings, executor).values
-            for executor in (None, Workers("loky", 2))
-        ]
-        assert np.array_equal(*runs)
-        other = settings.model_copy(update={"seed": 6})
-        assert not np.array_equal(
-            runs[0], bootstrap(problem.with_records(records), experiment.estimator, found, other).values
-        )
+    settings = BootstrapSettings(bootstrap=6, seed=5)
+    runs = [
+        bootstrap(problem.with_records(records), experiment.estimator, found, settings, executor).values
+        for executor in (None, Workers("loky", 2))
+    ]
+    assert np.array_equal(*runs)
+    other = settings.model_copy(update={"seed": 6})
+    again = bootstrap(problem.with_records(records), experiment.estimator, found, other).values
+    assert not np.array_equal(runs[0], again)
 
 
 def test_drawing_a_record_twice_is_having_it_twice(lrm) -> None:
@@ -241,21 +235,6 @@ def test_percentiles_are_of_the_refits(lrm) -> None:
     assert np.all(resampled.intervals[:, 0] < ordered[2]) and np.all(resampled.intervals[:, 1] > ordered[-3])
 
 
-def test_what_was_not_measured_cannot_be_made_up(lrm) -> None:
-    experiment, problem, records, found = _fitted(lrm)
-    slopes = np.zeros((3, records[0].record.shape[1], 1))
-    node = np.arange(slopes.shape[1])
-    shared = Correlation((slopes,), (slopes,), node, np.ones((len(node) - 1, 1)))
-    drifting = tuple(replace(each, correlation=shared) for each in records)
-    with pytest.raises(ProblemError, match="to simulate"):
-        bootstrap(
-            problem.with_records(drifting),
-            experiment.estimator,
-            found,
-            BootstrapSettings(bootstrap=2, method="parametric"),
-        )
-
-
 @pytest.mark.slow
 def test_a_run_leaves_the_bootstrap_beside_the_curvature(tmp_path: Path) -> None:
     out = tmp_path / "run"
@@ -276,7 +255,7 @@ def test_a_run_leaves_the_bootstrap_beside_the_curvature(tmp_path: Path) -> None
     assert (out / "earlier" / "1" / "bootstrap.csv").is_file()
 
 
-@pytest.mark.parametrize("setting", ["bootstrap=-1", "bootstrap=2.5", "blocks=0", "blocks=many", "method=jackknife"])
+@pytest.mark.parametrize("setting", ["bootstrap=-1", "bootstrap=2.5", "blocks=0", "blocks=many", "profile=[x]"])
 def test_settings_that_mean_nothing_are_bad_input(tmp_path: Path, setting: str) -> None:
     done = CliRunner().invoke(cli, ["run", DEMO, "--out", str(tmp_path / "r"), "--set", f"uncertainty.{setting}"])
     assert done.exit_code == 2 and "uncertainty" in done.output

@@ -80,8 +80,7 @@ def test_pixels_are_simulated_with_their_own_noise(place: Path) -> None:
 
 def test_a_prediction_of_pixels_says_how_many_it_may_be_off(place: Path) -> None:
     simulated("records.csv", CAMERA, 1, 60)
-    armcal("run", "arm.yaml", "--out", "run", "--parallel", "1", "--set", "uncertainty.bootstrap=4",
-           "--set", "uncertainty.method=parametric")  # fmt: skip
+    armcal("run", "arm.yaml", "--out", "run", "--parallel", "1")
     new = simulated("new.csv", CAMERA, 2, 400)
     armcal("predict", "run/calibration.yaml", "--poses", "new.csv", "--out", "predicted.csv")
     found = columns("predicted.csv")

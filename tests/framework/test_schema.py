@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RECORDED = ROOT / "tests" / "data" / "schema.json"
 # Mappings whose keys are names of parameters, groups, joints, designs, libraries, and not of the format.
 NAMED = re.compile(
-    r"groups|profile|bootstrap\.parameters|noise\.scatter|seconds|provenance\.(versions|plugins)|excitation_rad_or_m"
+    r"groups|bootstrap\.parameters|noise\.scatter|seconds|provenance\.(versions|plugins)|excitation_rad_or_m"
     r"|expected_sd|(parameters\.)?determined_by|minimal\.sd_ordinary_sizes|designs(\.\*\.areas(\.\*\.quantities)?)?|holding_Nm|candidates\.left_out"
     r"|half_width_90|summary(\.\*)?|frames"
 )
@@ -34,7 +34,7 @@ FAST = "--set evaluator=interpreted"
 RUNS: dict[str, tuple[str, ...]] = {
     "run": (
         f"run {DEMO} --out {{out}}/run --json {FAST} --set uncertainty.bootstrap=2 --set validation.folds=2"
-        " --set 'uncertainty.profile=[arm.spring.k1]' --set noise.loss=reject --set validation.limit_mm=1"
+        " --set noise.loss=reject --set validation.limit_mm=1"
         " --set 'statics.gravity_m_s2=[5, 0, -8]' --accept",
     ),
     "run, noise estimated": (

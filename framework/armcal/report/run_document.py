@@ -19,7 +19,7 @@ from armcal.estimate.identifiability import (
 from armcal.plugins import PluginRegistry, said
 from armcal.report import run_figures as figures
 from armcal.report import run_tables as tables
-from armcal.report.document import Code, Document, Part, Section, Table
+from armcal.report.document import Code, Document, Level, Part, Section, Table
 from armcal.report.numbers import NONE, count, fixed, plural, significant
 from armcal.run.outputs import metrics
 from armcal.run.result import RunResult
@@ -134,12 +134,12 @@ def _parameters(result: RunResult) -> list[Section]:
     if not count_free:
         text = "No parameter was free: the model stands as it was given."
         return [Section("Parameters", parts=[text], name="parameters")]
-    table = tables.parameters_table(estimate, result.bootstrap, result.profiles)
-    requested = result.bootstrap is not None or bool(result.profiles)
+    table = tables.parameters_table(estimate, result.bootstrap)
     listed, title = _some(table, tables.principal_table(estimate)), f"Table of {plural(count_free, 'free parameter')}"
+    level: Level = "verbose" if result.bootstrap is None else "always"
     return [
         Section("What was corrected", parts=_some(figures.corrections(estimate)), name="corrections"),
-        Section(title, parts=listed, name="parameters", folded=True, level="always" if requested else "verbose"),
+        Section(title, parts=listed, name="parameters", folded=True, level=level),
     ]
 
 

@@ -13,7 +13,7 @@ from armcal.base.units import shown_unit
 from armcal.diagnose.outliers import large_errors
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import DETERMINED_BY
-from armcal.estimate.uncertainty import Bootstrap, Profile
+from armcal.estimate.uncertainty import Bootstrap
 from armcal.estimate.validation import ErrorSummary
 from armcal.report.document import Table
 from armcal.report.numbers import NONE, common_decimals, count, decimals_for, fixed, significant
@@ -22,7 +22,6 @@ from armcal.run.result import ErrorTable, GroupError, RunResult
 SETS = {"train": "training", "holdout": "held out", "cross_validated": "cross-validated"}
 MOST_LISTED = 50  # of records set aside and of correlated pairs; the rest is counted
 _WORST = 10
-_ENDS = {"crossed": "", "bound": "at its bound", "open": "does not end as far as was looked"}
 
 
 def errors_table(caption: str, errors: ErrorTable) -> Table:
@@ -66,9 +65,9 @@ def groups_table(groups: Sequence[GroupError], unit: str) -> Table:
     return Table(caption, headings, rows, left=("Part",))
 
 
-def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None, profiles: Sequence[Profile] = ()) -> Table:
-    """A row a free canonical entry in customary units, with its intervals by curvature, by refits and by profile."""
-    nominal, profiled, rows = estimate.parameters.nominal(), {profile.name: profile for profile in profiles}, []
+def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None) -> Table:
+    """A row a free canonical entry in customary units, with its intervals by curvature and by refits."""
+    nominal, rows = estimate.parameters.nominal(), list[tuple[str, ...]]()
     units = [unit for block in estimate.parameters.free for unit in block.entry_units]
     for i, (name, own) in enumerate(estimate.items()):
         factor, unit = shown_unit(units[i])
@@ -87,23 +86,13 @@ def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None, pro
         row += [fixed(sd, digits), words]
         if bootstrap is not None:
             row += [fixed(factor * float(bootstrap.deviations[i]), digits), span(*bootstrap.intervals[i])]
-        if profiled:
-            profile = profiled.get(name)
-            row.append(span(profile.lower, profile.upper) if profile else "")
-            sides = [("lower", profile.lower_end), ("upper", profile.upper_end)] if profile else []
-            remarks += [f"{side} end {_ENDS[end]}" for side, end in sides if _ENDS[end]]
-            better = profile is not None and profile.better_fit_found
-            remarks += ["a better fit was found on the way: try more starts"] if better else []
-        rows.append((*row, unit, ", ".join(dict.fromkeys(remarks))))
+        rows.append((*row, unit, ", ".join(remarks)))
     headings = ["Parameter", "Nominal", "Calibrated", "Correction", "sd", "95 % interval"]
     headings += ["Bootstrap sd", "By bootstrap"] if bootstrap else []
-    headings += ["By profile"] if profiled else []
     caption = "Free parameters, with standard deviation (sd) and 95 % intervals"
     if bootstrap is not None:
-        how = f"blocks of {bootstrap.block}" if bootstrap.method == "blocks" else "parametric"
         failed = f", {bootstrap.failed} more did not converge" if bootstrap.failed else ""
-        caption += f". Bootstrap: {len(bootstrap.values)} refits{failed}; {how}"
-    caption += ". By profile: everything else was fitted again, within bounds, for each value" if profiled else ""
+        caption += f". Bootstrap: {len(bootstrap.values)} refits{failed}; blocks of {bootstrap.block}"
     return Table(caption, (*headings, "Unit", "Remark"), rows, ("Unit", "Remark"), ("Nominal", "Correction", "sd"))
 
 

@@ -187,12 +187,6 @@ class ValidationSettings(Settings):
         return self
 
 
-class UncertaintySettings(BootstrapSettings):
-    """How intervals are made beside the curvature at the estimate; ``profile`` are globs over free numbers."""
-
-    profile: tuple[str, ...] = ()
-
-
 class PlanSettings(Settings):
     """How poses are planned.
 
@@ -238,7 +232,7 @@ class ExperimentSettings(Settings):
     evaluator: Literal["auto", "compiled", "interpreted"] = "auto"
     validation: ValidationSettings = Field(default_factory=ValidationSettings)
     noise: NoiseSettings = Field(default_factory=NoiseSettings)
-    uncertainty: UncertaintySettings = Field(default_factory=UncertaintySettings)
+    uncertainty: BootstrapSettings = Field(default_factory=BootstrapSettings)
     plan: PlanSettings | None = None
     bench: dict[str, Any] | None = None
 

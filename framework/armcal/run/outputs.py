@@ -35,11 +35,10 @@ FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "cal
 NOT_CONVERGED_SUFFIX = ".not-converged"
 DO_NOT_USE_SUFFIX = ".do-not-use"
 UNREADABLE_SUFFIX = ".unreadable"
-PROFILE_FILE = "profile.json"  # Only where profiles were asked for
 _OURS = (
-    PROFILE_FILE,
-    "bootstrap.csv",  # of runs by earlier versions, which made these two files
+    "bootstrap.csv",  # of runs by earlier versions, which made these three files
     "log.txt",
+    "profile.json",
     *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX, UNREADABLE_SUFFIX)),
     *FILES,
 )
@@ -72,8 +71,6 @@ def write(
     """
     texts: dict[str, str] = {}
     fault: ArmcalError | None = None
-    if result.profiles:  # each by its parameter (SI), with its curve
-        texts[PROFILE_FILE] = as_json({profile.name: profile.as_dict() for profile in result.profiles}) + "\n"
     texts |= {
         "experiment.yaml": dump(experiment.source.data),
         "residuals.csv": residuals_text(result),
@@ -129,7 +126,6 @@ def metrics(result: RunResult) -> dict[str, Any]:
         "structure": evidence(result.fit),
         "prediction_intervals": result.intervals.as_dict(),
         "bootstrap": _bootstrap_metrics(result),
-        "profile": {p.name: {k: v for k, v in p.as_dict().items() if k != "curve"} for p in result.profiles} or None,
         "warnings": list(result.warnings),
         "evaluator": result.backend,
         "seconds": dict(result.seconds),
@@ -237,7 +233,6 @@ def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
         return None
     rows = zip(bootstrap.names, bootstrap.deviations, bootstrap.intervals, strict=True)
     return {
-        "method": bootstrap.method,
         "refits": len(bootstrap.values),
         "failed": bootstrap.failed,
         "block_records": bootstrap.block,

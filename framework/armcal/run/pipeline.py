@@ -25,7 +25,7 @@ from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import hopeless, mislabelled, restricted, started, typical_off
 from armcal.estimate.robust import WeighedFit, fit, held_fit, plain_fit
 from armcal.estimate.start import FAR, Start, aligned_start, with_proposals
-from armcal.estimate.uncertainty import Bootstrap, Profile, bootstrap, profiled, profiles
+from armcal.estimate.uncertainty import Bootstrap, bootstrap
 from armcal.estimate.validation import cross_validate, error_unit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
@@ -82,11 +82,11 @@ def calibrate(
         plain = Fit(ready, fitted(context, ready), experiment.estimator)
     faults += registry.notify("armcal_estimate_changed", estimate=plain.estimate)
     learned, outcome = with_pose_residual(context, plain)
-    resampled, profiled = uncertainty(context, plain)
+    resampled = uncertainty(context, plain)
     result = judged(context, validated(context, learned), outcome)
     faults += _notify_rejected(registry, result.noise.set_aside)
     warnings = (*result.warnings, *dict.fromkeys(faults))
-    return replace(result, command=command, warnings=warnings, bootstrap=resampled, profiles=profiled)
+    return replace(result, command=command, warnings=warnings, bootstrap=resampled)
 
 
 def prepare(
@@ -177,7 +177,6 @@ def _checked(
         hint = "Leave it out: records are explained that miss by far more than the median."
         raise ConfigError("found a length, and nothing measured is a length.", where=where, hint=hint)
     problem = restricted(ready.training).with_records(problem.records)
-    profiled(problem, settings.uncertainty.profile)
     named = mislabelled(ready.problem, dataset)
     return replace(
         ready,
@@ -262,21 +261,16 @@ def with_pose_residual(context: RunContext, plain: Fit) -> tuple[Fit, ResidualOu
         return replace(learned, fitted=_widened(learned)), replace(outcome, moved=moved)
 
 
-def uncertainty(context: RunContext, plain: Fit) -> tuple[Bootstrap | None, tuple[Profile, ...]]:
+def uncertainty(context: RunContext, plain: Fit) -> Bootstrap | None:
     """What was asked for beyond the covariance, of a fit that converged."""
-    experiment, parts = context.experiment, (context.executor, context.progress)
-    settings, estimate, ready = experiment.settings.uncertainty, plain.estimate, plain.ready
-    resampled: Bootstrap | None = None
-    profiled: tuple[Profile, ...] = ()
-    if settings.bootstrap and plain.converged and estimate.names:
-        with context.watch.stage("bootstrap"):
-            poses = experiment.poses(ready.trained)
-            own = (ready.training, experiment.estimator, estimate, settings)
-            resampled = bootstrap(*own, *parts, poses)
-    if settings.profile and plain.converged:
-        with context.watch.stage("profile"):
-            profiled = profiles(plain.fitted, experiment.estimator, settings.profile, *parts)
-    return resampled, profiled
+    experiment, estimate, ready = context.experiment, plain.estimate, plain.ready
+    settings = experiment.settings.uncertainty
+    if not (settings.bootstrap and plain.converged and estimate.names):
+        return None
+    with context.watch.stage("bootstrap"):
+        poses = experiment.poses(ready.trained)
+        own = (ready.training, experiment.estimator, estimate, settings)
+        return bootstrap(*own, context.executor, context.progress, poses)
 
 
 def validated(context: RunContext, own: Fit) -> Fit:

@@ -19,7 +19,7 @@ from armcal.diagnose.verdict import Verdict
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
 from armcal.estimate.prediction import ResidualSpread, residual_spread
-from armcal.estimate.uncertainty import Bootstrap, Profile
+from armcal.estimate.uncertainty import Bootstrap
 from armcal.estimate.validation import ErrorSummary, Split, summarise
 from armcal.estimate.variance import VarianceComponents
 from armcal.problem.problem import Problem
@@ -201,7 +201,6 @@ class RunResult:
         provenance: hashes and versions.
         noise: how the training records weighed.
         bootstrap: refits to resampled records, if they were asked for.
-        profiles: intervals by profile likelihood, of the numbers asked for.
         prediction: what predictions need of the run beyond the values; None if it did not converge.
         groups: errors of groups of records, where a column separates them.
         pose_residual: what became of one that was to be learned.
@@ -216,7 +215,6 @@ class RunResult:
     provenance: dict[str, Any]
     noise: NoiseResult = field(default_factory=NoiseResult)
     bootstrap: Bootstrap | None = None
-    profiles: tuple[Profile, ...] = ()
     prediction: PredictionRecord | None = None
     groups: tuple[GroupError, ...] = ()
     pose_residual: ResidualOutcome | None = None
