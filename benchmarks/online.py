@@ -53,7 +53,7 @@ class Case:
         for i in range(updates):
             reading = self.readings[i % len(self.readings)]
             observation = self.observer.observation(belief, (reading,))
-            belief = belief.updated(space, estimator.update(belief.gaussian, [observation]).posterior)
+            belief = belief.updated(space, estimator.update(belief.gaussian, observation).posterior)
         return belief
 
 

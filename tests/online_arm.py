@@ -131,7 +131,7 @@ def begun_setup(
 ) -> FilterSetup:
     """What a filter of the arm stands on; the observer's buffers are shared."""
     given = settings(evaluator=evaluator, process_noise=random_walk(walk, held_base))
-    return filter_setup(calibration(noise_mm, sd_factor, held_base), given, shares=True)
+    return filter_setup(calibration(noise_mm, sd_factor, held_base), given)
 
 
 @dataclass
@@ -246,7 +246,7 @@ class Filtered:
     def take(self, channels: Mapping[str, float], seconds: float = EVERY_S) -> Update:
         """One record."""
         before = self.setup.process_noise.faded(self.belief, {"time": seconds})
-        update = self.estimator.update(before.gaussian, [self.seen(before, channels)])
+        update = self.estimator.update(before.gaussian, self.seen(before, channels))
         self.belief = before.updated(self.setup.space, update.posterior)
         return update
 

@@ -39,7 +39,6 @@ WORDS: Mapping[str, str] = MappingProxyType(
         "groups": "the keys of all groups that the records have.",
         "joint": "a joint's name.",
         "measured": "what the record says, by the local names of the channels (SI).",
-        "observations": "records, the newest last, each ready to be looked at from anywhere.",
         "progress": "receives what is being done, and which fraction of it is done.",
         "pulse": "its length (s).",
         "register": "the number of the first register.",

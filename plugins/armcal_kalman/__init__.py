@@ -1,1 +1,1 @@
-"""Online estimators: Kalman filters, and the last records solved together."""
+"""Online estimators: a Kalman filter."""

@@ -204,16 +204,11 @@ def test_days_need_no_more_memory_and_come_out_the_same_twice(count: int) -> Non
     assert _steadily(recalibrator, fresh, count)[0] == state
 
 
-RUNS = {"extended": {"type": "extended"}, "window": {"type": "window", "records": 6}}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 3])
-@pytest.mark.parametrize("estimator", RUNS)
-def test_a_restored_state_goes_on_as_if_nothing_had_been(estimator: str, every: int) -> None:
+def test_a_restored_state_goes_on_as_if_nothing_had_been(every: int) -> None:
     """At such records of a run in which a joint slips: a snapshot as a journal keeps it, taken up by another."""
-    given = settings(estimator=RUNS[estimator])
-    one, other, arm = begun(given), begun(given), World.drawn(31, outliers=0.05)
+    one, other, arm = begun(), begun(), World.drawn(31, outliers=0.05)
     records, snapshots, states, decided = [], [], [], 0
     for sequence in range(1, 41):
         if sequence == 22:

@@ -12,7 +12,6 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
-from armcal.errors import ConfigError
 from armcal.estimate.online import Gaussian
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
@@ -254,40 +253,15 @@ def test_from_nominal_values_on_shuffled_records_it_ends_within_two_percent_of_t
     assert ends <= 1.02 * aim
 
 
-@pytest.mark.slow
-def test_the_window_starts_from_nominal_values_as_well(poses: Path, tmp_path: Path) -> None:
-    """Option 1, of whose records the last 20 are held."""
-    first = calibrated("option1", poses, tmp_path)
-    noise_mm = 0.5 * float(first.record.noise["scale"])
-    batch = calibrated("option1", poses, tmp_path, f"measurements.tracker.noise_mm={noise_mm!r}")
-    experiment = Experiment.load(ROOT / "configs" / "lrm_arm" / "option1.yaml", data=poses)
-    dataset = experiment.read()
-    session = from_nominal(batch, experiment, {"type": "window", "records": 20})
-    for k, i in enumerate(np.random.default_rng(1).permutation(len(dataset))):
-        channels = {name: float(values[i]) for name, values in dataset.channels.items()}
-        session.take(Incoming(dataset.ids[i], channels, {}, 0.0), k + 1)
-    ends, aim = (mean_error(session, dataset, v) for v in (session.values, batch.parameters.nominal()))
-    print(f"window: {ends:.3f} mm, batch {aim:.3f} mm")
-    assert ends <= 1.005 * aim
-
-
-@pytest.mark.slow
-def test_the_window_is_refused_for_matrices(poses: Path, tmp_path: Path) -> None:
-    found = calibrated("best", poses, tmp_path, "parameters.drift={}")
-    with pytest.raises(ConfigError, match="3x3 compliances"):
-        Recalibrator(found, RecalibrateSettings(estimator={"type": "window"}))
-
-
-def from_nominal(batch: Calibration, experiment: Experiment, estimator: dict | None = None) -> Recalibrator:
+def from_nominal(batch: Calibration, experiment: Experiment) -> Recalibrator:
     """A session that knows nothing but nominal values and priors, five times the typical scale where none is stated."""
-    settings = RecalibrateSettings(gating=False, model_error="white", estimator=estimator or {"type": "extended"})
-    session = Recalibrator(batch, settings)
+    session = Recalibrator(batch, RecalibrateSettings(gating=False, model_error="white"))
     free = session.setup.space.parameters.free
     stated = [(b, experiment.parameters[b.name].prior_sd or 5 * b.scale) for b in free]
     deviations = np.array([sd / b.scale for b, sd in stated for _ in range(b.domain.dof)])
     start = Gaussian(np.zeros(len(deviations)), np.diag(deviations**2))
     belief = Belief(experiment.parameters.nominal(), start)
-    session.state = replace(session.state, belief=belief, anchor=belief)
+    session.state = replace(session.state, belief=belief)
     return session
 
 

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from armcal.estimate.online import Gaussian, Linearised, kalman_update, log_likelihood
+from armcal.estimate.online import Gaussian, Linearised, log_likelihood
 from armcal_online.tracking.belief import Belief, GaussMarkovStates, ProcessNoise, shared_error
 from armcal_online.tracking.hypotheses import Hypothesis, SlowChanges, SlowState
+from joseph import kalman_update
 from online_arm import World, begun, settings, told
 
 N, RECORDS, SECONDS = 3, 40, 3600.0

@@ -6,7 +6,6 @@ keeps its small eigenvalues when angles stand beside compliances. [BarShalom2001
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -57,15 +56,9 @@ class Update:
 class OnlineEstimator(Protocol):
     """What a plugin provides to take one record at a time. It keeps no state of its own."""
 
-    @property
-    def window(self) -> int:
-        """How many of the last records each update needs; 1 for a filter."""
-        return 1
+    def update(self, prior: Gaussian, observation: Observation) -> Update:
+        """The belief after a record; ``prior`` is the one before it.
 
-    def update(self, prior: Gaussian, observations: Sequence[Observation], start: Array | None = None) -> Update:
-        """The belief after the last observation; ``prior`` is the one before the first of them.
-
-        ``start`` (N) is the mean after all observations but the last; an iteration may begin there.
         A covariance that is not positive is an error, never made positive by abs().
 
         Raises:
@@ -101,16 +94,6 @@ def log_density(nis: float, log_determinant: float, count: int, freedom: float =
     whole = 0.5 * (freedom + count)
     normal = math.lgamma(whole) - math.lgamma(0.5 * freedom) - 0.5 * count * math.log(freedom * math.pi)
     return normal - 0.5 * log_determinant - whole * math.log1p(nis / freedom)
-
-
-def kalman_update(prior: Gaussian, record: Linearised, point: Array) -> Gaussian:
-    """The belief after a record that was linearised at a point (N), in Joseph's form [Bucy1968]."""
-    innovation = record.innovation + record.slope @ (point - prior.mean)
-    across = prior.covariance @ record.slope.T
-    gain = np.linalg.solve(record.slope @ across + record.noise, across.T).T
-    kept = np.eye(len(prior.mean)) - gain @ record.slope
-    covariance = kept @ prior.covariance @ kept.T + gain @ record.noise @ gain.T
-    return checked(Gaussian(prior.mean + gain @ innovation, covariance))
 
 
 def checked(belief: Gaussian) -> Gaussian:

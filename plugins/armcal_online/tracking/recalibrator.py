@@ -18,7 +18,7 @@ from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
 from armcal.config.system import build_component
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ArmcalError, ConfigError, DataError, Location
+from armcal.errors import ArmcalError, DataError, Location
 from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innovation_squared
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
@@ -53,24 +53,17 @@ class Recalibrator:
         source = ConfigSource({"estimator": settings.estimator}, {(): Location()}, Path(), Path(), ())
         estimator: OnlineEstimator = build_component(source, registry or discover(), "online", ("estimator",))[0]
         self._calibration, self.settings, self._estimator = calibration, settings, estimator
-        is_filter = estimator.window == 1
-        self.setup = setup = filter_setup(calibration, settings, shares=is_filter, loads=settings.gating)
-        if not is_filter and setup.space.cones:
-            raise ConfigError(
-                "found an estimator that holds records back, and 3x3 compliances: together they may not converge.",
-                where=Location("estimator.type"),
-                hint="Take extended, which linearises each record again from where it leads.",
-            )
+        self.setup = setup = filter_setup(calibration, settings, settings.gating)
         self.steps = steps = find_steps(calibration, setup.observer, setup.belief.origin)
         hypothesis_filter = HypothesisFilter(setup.observer, estimator, setup.process_noise, settings.outliers)
         changes = hypotheses(setup.space, steps, settings.changes, setup.observer.size)
-        slow = slow_changes(changes, steps, settings.changes, setup.observer.size) if is_filter else ()
+        slow = slow_changes(changes, steps, settings.changes, setup.observer.size)
         if hypothesis_filter.is_model_wrong:
             # Neighbours err alike: a load that no record shows cannot be distinguished from the error of the model.
             slow = tuple(change for change in slow if change.kind in GRADUAL)
         self._slow = SlowChanges(slow, setup.process_noise, settings.changes.probability)
         self._judge = Judge(setup.space, steps, hypothesis_filter, changes, self._slow, settings)
-        self.state = State(setup.belief, setup.belief)
+        self.state = State(setup.belief)
 
     @property
     def request(self) -> ReadRequest:
@@ -146,8 +139,7 @@ class Recalibrator:
         """Gate a record, take it in if it is accepted, and judge what the last records mean now."""
         process_noise, observer = self.setup.process_noise, self.setup.observer
         before = self._slow.carried(state.slow, process_noise.faded(state.belief, passed), passed["time"])
-        anchor = process_noise.faded(state.anchor, passed) if state.held else before
-        state = replace(state, belief=before, anchor=anchor, slow=self._slow.passed(state.slow, passed))
+        state = replace(state, belief=before, slow=self._slow.passed(state.slow, passed))
         try:
             gated, first, limit = self._gated(state, readings, passed)
             state, decisions = self._judge.after(gated) if self.settings.gating else (gated, ())

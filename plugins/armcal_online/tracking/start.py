@@ -63,15 +63,12 @@ class FilterSetup:
     model_errors: Mapping[str, ModelError]
 
 
-def filter_setup(
-    calibration: Calibration, settings: RecalibrateSettings, shares: bool, loads: bool = False
-) -> FilterSetup:
+def filter_setup(calibration: Calibration, settings: RecalibrateSettings, loads: bool = False) -> FilterSetup:
     """What a recalibration starts with.
 
     Args:
         calibration: with its covariance.
         settings: of the recalibration.
-        shares: whether what neighbouring records share is followed beside the parameters; else it is noise.
         loads: whether a payload that no record states, and another direction of gravity, may be found.
 
     Raises:
@@ -83,7 +80,7 @@ def filter_setup(
     space = StateSpace(parameters)
     parts = (parameters, system.environment, _full_record(calibration, measurements), settings.evaluator)
     problem = Problem.build(system.arms, measurements, *parts, groups=calibration.record.groups)
-    follows = shares and settings.model_error == "calibrated"
+    follows = settings.model_error == "calibrated"
     white, shared, model_errors = _noise_and_model_errors(calibration, measurements, follows)
     drifts = _drifts(calibration, space)
     followed = GaussMarkovStates((*drifts, *shared) if follows else ())

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import DataError
-from armcal.estimate.online import Gaussian, OnlineEstimator, kalman_update
+from armcal.estimate.online import Gaussian, OnlineEstimator
 from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, fdtri
 
 from armcal_online.tracking.belief import Belief, most_likely
@@ -165,8 +165,6 @@ class State:
     """
 
     belief: Belief  # about parameters and Gauss-Markov states
-    anchor: Belief  # the belief before the records that the estimator still holds
-    held: tuple[Recent, ...] = ()  # those records; none for a filter
     recent: tuple[Recent, ...] = ()  # the last records, for judgement
     clock: Clock = field(default_factory=Clock)  # by records
     place: float | None = None  # the last record's ``sequence``; None before the first
@@ -186,7 +184,7 @@ class State:
     slow: SlowState = field(default_factory=SlowState)  # evidence of slow changes, and trends that were found
 
     def following(self, belief: Belief, **changes: Any) -> State:
-        return replace(self, belief=belief, anchor=belief, held=(), **changes)
+        return replace(self, belief=belief, **changes)
 
     def known(self, sequence: int) -> Arrival | None:
         return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
@@ -199,7 +197,7 @@ class State:
     def as_dict(self) -> dict[str, Any]:
         content = _encoded(self)
         content["nis"] = content.pop("nis_window")
-        return {**content, "anchor": content["anchor"] if self.held else None}
+        return dict(content)
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> State:
@@ -209,8 +207,7 @@ class State:
             DataError: an array is not whole.
             KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
         """
-        anchor = content["belief"] if content["anchor"] is None else content["anchor"]
-        state: State = _decoded(cls, {**content, "anchor": anchor, "nis_window": content["nis"]})
+        state: State = _decoded(cls, {**content, "nis_window": content["nis"]})
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
         return state
@@ -277,31 +274,16 @@ def _decoded(kind: Any, content: Any) -> Any:
 def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
     """The state with a record taken in by an estimator.
 
-    The state's belief and anchor are those at the record's time; of NIS it keeps ``nis_window``.
+    The state's belief is that at the record's time; of NIS it keeps ``nis_window``.
 
     Raises:
         NotConvergedError: the arm has no elastic equilibrium near the belief.
         ProblemError: the numbers of the belief are no longer sound.
     """
-    space, observer, before = setup.space, setup.observer, state.belief
-    if estimator.window == 1:
-        observation = observer.observation(before, recent.readings, recent.joint_noise)
-        belief = before.updated(space, estimator.update(before.gaussian, [observation]).posterior)
-        anchor, held = belief, state.held
-    else:
-        # A record that leaves the window is taken for good, linearised where the records after it lead.
-        held = (*state.held, recent)
-        prior = state.anchor.about(space, before.origin).gaussian
-        observations = [observer.observation(before, record.readings, record.joint_noise) for record in held]
-        update = estimator.update(prior, observations, before.gaussian.mean)
-        belief = before.updated(space, update.posterior)
-        if len(held) >= estimator.window:
-            point = update.posterior.mean
-            prior, held = kalman_update(prior, observations[0].at(point), point), held[1:]
-        anchor = Belief(before.origin, prior)
+    space, before = setup.space, state.belief
+    observation = setup.observer.observation(before, recent.readings, recent.joint_noise)
+    belief = before.updated(space, estimator.update(before.gaussian, observation).posterior)
     if state.counts["accepted"] % _REFRESHED == _REFRESHED - 1:
         # Where bounds hold, steps of the mean lead the origin astray slowly.
         belief = belief.about(space, most_likely(space, belief))
-        anchor = anchor if held else belief
-    nis = (*state.nis_window, (recent.nis, recent.dof))[-nis_window:]
-    return replace(state, belief=belief, anchor=anchor, held=held, nis_window=nis)
+    return replace(state, belief=belief, nis_window=(*state.nis_window, (recent.nis, recent.dof))[-nis_window:])

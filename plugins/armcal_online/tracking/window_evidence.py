@@ -511,7 +511,7 @@ class HypothesisFilter:
             first = observation.at(belief.gaussian.mean)
             freedom, stated = self.freedom(record), self._outlier_covariance(record)
             outside = np.log(share) + log_density_of_outlier(first.innovation, first.noise, stated, freedom)
-            update = self._estimator.update(belief.gaussian, [observation])
+            update = self._estimator.update(belief.gaussian, observation)
         except ArmcalError:
             return candidate
         within = np.log(1 - share) + log_likelihood(update.innovation, update.covariance, freedom)

@@ -15,8 +15,10 @@ from armcal.base.units import from_unit, split_suffix
 from armcal.calibration.exporter import Exported
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Solution, SolverVerdict, no_progress
-from armcal.estimate.online import Gaussian, Update, checked, kalman_update
+from armcal.estimate.online import Gaussian, Update, checked
 from armcal.problem.problem import PosedProblem
+
+from tests.joseph import kalman_update
 
 COUNTER = itertools.count()
 
@@ -205,13 +207,12 @@ class Filter:
     """Sound: a Kalman filter."""
 
     Settings: ClassVar[Any] = PlainSettings
-    window = 1
 
     def __init__(self, settings: Any) -> None:
         pass
 
-    def update(self, prior: Any, observations: Any, start: Any = None) -> Any:
-        seen = self.seen(observations[-1].at(prior.mean))
+    def update(self, prior: Any, observation: Any) -> Any:
+        seen = self.seen(observation.at(prior.mean))
         posterior = self.posterior(prior, seen)
         expected = seen.slope @ prior.covariance @ seen.slope.T + seen.noise
         return Update(posterior, seen.innovation, expected)
