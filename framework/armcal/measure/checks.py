@@ -6,8 +6,9 @@ records set aside or a warning added, or raises `DataError`. ``check_dataset`` r
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -17,37 +18,15 @@ from armcal.base.units import split_suffix, to_unit
 from armcal.errors import DataError, Location
 from armcal.measure.groups import first_of_pose
 from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
-from armcal.measure.missing import set_aside_not_finite
+from armcal.measure.missing import set_aside_not_finite, with_absent
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel
 from armcal.plugins import expecting, refuse
-
-__all__ = [
-    "Layout",
-    "check_dataset",
-    "check_records",
-    "layout_of",
-    "records_of",
-    "refuse_approaches",
-    "refuse_conflicting_ids",
-    "refuse_impossible_surroundings",
-    "refuse_joint_count",
-    "refuse_joint_units",
-    "require_records",
-    "set_aside_backward_time",
-    "set_aside_duplicates",
-    "set_aside_frozen",
-    "set_aside_not_finite",
-    "set_aside_without_noise",
-    "set_aside_zeros",
-    "warn_kelvin",
-    "warn_repeated_poses",
-    "warn_small_degrees",
-]
 
 FROZEN_RECORDS = 5  # So many identical measurements in a row, while the joints moved, and the instrument has stopped
 MAX_BACKWARD_FRACTION = 0.01
 """Of the records; more of them out of order in time, and the time itself is not to be trusted."""
 
+_NONE: Mapping[str, str] = MappingProxyType({})
 _DIGITS = "0123456789"
 _FULL_TURN = 2 * math.pi
 _SMALL_DEGREES = (0.5, 6.3)
@@ -82,6 +61,25 @@ def records_of(reader: Reader, request: ReadRequest) -> Dataset:
                 refuse(reader.read, given, "every channel of the request that is required")
     layout = layout_of(request.channels, dataset, {}, {}, by_line=False)
     return check_records(dataset, replace(layout, units=dict.fromkeys(layout.revolute, "deg")))
+
+
+def read_as(
+    dataset: Dataset,
+    request: ReadRequest,
+    columns: Mapping[str, str] = _NONE,
+    units: Mapping[str, str] = _NONE,
+    *,
+    by_line: bool = True,
+    by_id: bool = False,
+) -> Dataset:
+    """What a reader gives back: its records with all that a request needs, checked; see ``Layout`` for the rest.
+
+    Raises:
+        DataError: the dataset is refused, or no record is left.
+    """
+    dataset = with_absent(dataset, request.channels)
+    layout = layout_of(request.channels, dataset, columns, units, by_line=by_line)
+    return check_dataset(dataset, replace(layout, by_id=by_id))
 
 
 def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:

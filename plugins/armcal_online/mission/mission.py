@@ -1,6 +1,5 @@
 """A simulated mission: calibrated before launch, recalibrated record by record, compared with its truth."""
 
-import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_prog
 from armcal.estimate.polish import descended, polish
 from armcal.estimate.robust import reweighted
 from armcal.io.lines import StandardOutput
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.csv_writer import csv_text, write_csv
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import PosedProblem, Problem
 from armcal.run.experiment import Experiment
@@ -397,9 +396,7 @@ def curve_text(curve: ErrorCurve, mission: Mission) -> str:
         "temperature_C": truth.temperature_at(curve.times).round(3).tolist(),
         **{truth.parameters.entry_names[i]: values[:, i].tolist() for i in np.flatnonzero(np.ptp(values, axis=0))},
     }
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
-    return stream.getvalue()
+    return csv_text([columns, *zip(*columns.values(), strict=True)], "")
 
 
 def run_mission(
