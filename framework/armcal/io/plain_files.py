@@ -84,7 +84,7 @@ def text_of(content: bytes, path: Path | str, hint: str, line: int = 1, offset: 
     try:
         text = content.decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as undecodable:
-        if not 0 <= at < undecodable.start:
+        if at < 0:
             at = undecodable.start
             fault = f"the byte 0x{content[at]:02x}{{}}, which is not UTF-8 text"
     if at >= 0:
