@@ -194,7 +194,6 @@ class FileLines(LineSource):
     """Lines of a file that grows. One that was cut or replaced is read from its start, in a call of its own.
 
     Attributes:
-        header: the first line at the time of opening; None if it was not whole.
         renewed: how often the file was cut or replaced.
     """
 
@@ -204,8 +203,6 @@ class FileLines(LineSource):
         self._path = path
         self._cutter, self._position, self.renewed = LineCutter(LONGEST_LINE_BYTES), 0, 0
         self._file = path.open("rb", buffering=0)
-        first, ended, _ = os.pread(self._file.fileno(), LONGEST_LINE_BYTES, 0).partition(b"\n")
-        self.header = first.removesuffix(b"\r") if ended else None
         if begin == "end":
             size = os.fstat(self._file.fileno()).st_size
             start = max(0, size - LONGEST_LINE_BYTES)

@@ -32,12 +32,12 @@ MAX_BYTES = 2 * 1024**3
 MAX_LINE_BYTES = 1024**2
 BLANKS = " "
 """As a delimiter: any number of blanks."""
+SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
 MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})  # In small letters
 DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 _ROWS_AT_ONCE = 256  # small blocks stay in the processor's cache: faster than thousands
 _LIKELY = "\t;|,"  # The likeliest first: where columns are parted by semicolons, commas are decimal ones
-SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
 _PARTS = re.compile(r"\s*[+-]?[0-9]*(?:[.,](?P<decimals>[0-9]*))?(?:[eE][+-]?(?P<exponent>[0-9]+))?\s*")
 _FEWEST_OTHERS = 10
 _UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters", "metres", "m/s^2", "m/s2"} - {"1"})
