@@ -15,10 +15,13 @@ from typing import Any
 
 import numpy as np
 import yaml
-from armcal_online.mission.mission import ErrorCurve, MissionPlan, before_launch, run_mission
-from armcal_online.mission.simulator import DAY_S
+from armcal.base.arrays import Array
+from armcal.calibration.calibration import Calibration
+from armcal_online.mission.mission import ErrorCurve, MissionLog, MissionPlan, before_launch, error_curve, run_mission
+from armcal_online.mission.simulator import DAY_S, with_payload
 
 from tests.mission_decisions import Decision, Occurrence, occurrences, verdicts
+from tests.mission_refits import refits
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "mission.yaml"
 DAYS, DAY = 10, 4.0
@@ -27,7 +30,6 @@ SHORT = (
     "simulation.records.every_min=20",
     "simulation.power_cuts=[]",
     "mission.poses=50",
-    "mission.refit={records: 40, every: 10}",
 )
 
 
@@ -108,9 +110,10 @@ def launch() -> Path:
 
 @dataclass(frozen=True)
 class Flown:
-    """One mission: errors, what happened, and what was decided."""
+    """One mission: errors, that of the refit of the last 40 records, what happened, and what was decided."""
 
     curve: ErrorCurve
+    recent: Array
     happened: tuple[Occurrence, ...]
     decisions: list[Decision]
 
@@ -125,7 +128,11 @@ def flown(case: str, seed: int) -> Flown:
     loaded = MissionPlan.load(CONFIG, (*SHORT, "mission.experiment=null", start, f"simulation.seed={seed}", *texts))
     with tempfile.TemporaryDirectory() as folder:
         mission, curve, content = run_mission(loaded, Path(folder))
-    return Flown(curve, occurrences(mission.settings.events, DAYS), content["decisions"])
+    before = with_payload(Calibration.load(launch(), loaded.experiment.registry).parameters)
+    references = refits(loaded, with_payload(loaded.experiment.parameters).with_nominal(before.nominal()), mission)
+    nothing_decided = MissionLog(estimates={0.0: {}}, levels=[(0.0, "nominal")])
+    recent = error_curve(loaded, before, mission, nothing_decided, references).errors["refit_recent"]
+    return Flown(curve, recent, occurrences(mission.settings.events, DAYS), content["decisions"])
 
 
 @dataclass(frozen=True)
@@ -149,7 +156,7 @@ class Row:
 def row(made: Flown) -> Row:
     """From the event's moment on, or from the first refit on without one."""
     curve, (found, alarms) = made.curve, verdicts(made.happened, made.decisions)
-    recent, filtered, days = curve.errors["refit_recent"], curve.errors["recalibrated"], curve.times / DAY_S
+    recent, filtered, days = made.recent, curve.errors["recalibrated"], curve.times / DAY_S
     first_refit = float(days[int(np.argmax(recent != curve.errors["frozen"]))])
     after = curve.is_hour & (days >= (made.happened[0].day if made.happened else first_refit))
     means = [float(1000 * errors[after].mean()) for errors in (filtered, recent, curve.errors["frozen"])]

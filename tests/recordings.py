@@ -50,7 +50,7 @@ class GuidedArm:
 
     @property
     def source(self) -> str:
-        return f"udp:127.0.0.1:{self.port}"
+        return f"udp:{self.port}"
 
     def stand(self, angles: Mapping[str, float], **more: Any) -> None:
         """And wait until the recorder's window holds nothing else."""

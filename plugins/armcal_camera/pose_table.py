@@ -28,13 +28,12 @@ from armcal.base.settings import Settings
 from armcal.base.units import DIMENSIONLESS, split_suffix
 from armcal.calibration.exporter import rigid_tools
 from armcal.errors import DataError
-from armcal.io.cells import is_number
 from armcal.io.plain_files import input_bytes, refuse, text_of
-from armcal.measure.checks import check_dataset, layout_of
+from armcal.measure.checks import read_as
 from armcal.measure.layout import warned
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import may_be_cut, whole_rows
+from armcal.measure.tables import is_number, may_be_cut, whole_rows
 from armcal.plugins import discover
 from scipy.spatial.transform import Rotation
 
@@ -359,4 +358,4 @@ def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
     poses = np.array(matrices)
     bare = Dataset(tuple(map(str, lines)), {}, rows=tuple(lines), source=str(path))
     dataset = posed.in_joints(bare, poses[:, :, 3].T, Rotation.from_matrix(poses[:, :, :3]))
-    return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=True))
+    return read_as(dataset, request)

@@ -203,7 +203,7 @@ class JsonLinesJointSettings(Settings):
         joints: the source's own names by joint (``{j1: shoulder}``); joints that are not named have their own.
     """
 
-    source: SourceName  # ``-`` (standard input), ``udp:PORT``, ``udp:HOST:PORT``, or a file that another program writes
+    source: SourceName  # ``-`` (standard input), ``udp:PORT``, or a file that another program writes
     begin: Begin = "end"  # from where a file is read
     joints: dict[str, str] = Field(default_factory=dict)
     values: str | None = None  # the key of a list of all joints in order, where they have no names

@@ -19,14 +19,12 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
-from armcal.io.cells import CellFault, read_cell
 from armcal.io.plain_files import input_bytes, refuse
-from armcal.measure.checks import check_dataset, layout_of
+from armcal.measure.checks import read_as
 from armcal.measure.instrument import named_arm
 from armcal.measure.measurement import GroupedMeasurement, noise_channels
-from armcal.measure.missing import with_absent
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import open_table
+from armcal.measure.tables import CellFault, open_table, read_cell
 
 _FULL_TURN = 2 * math.pi
 _NOISE = "noise"
@@ -100,9 +98,7 @@ class MukcaReader:
             hash_of(files),
             warnings=warnings,
         )
-        dataset = with_absent(dataset, request.channels)
-        layout = layout_of(request.channels, dataset, {}, {}, by_line=True)
-        checked = check_dataset(dataset, replace(layout, by_id=True))
+        checked = read_as(dataset, request, by_id=True)
         return _weighed(checked, request) if self._settings.weights == "positions" else checked
 
 

@@ -14,13 +14,11 @@ from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
-from armcal.io.cells import is_missing, is_number
 from armcal.io.plain_files import refuse
-from armcal.measure.checks import check_dataset, layout_of
-from armcal.measure.missing import with_absent
+from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
 from armcal.measure.rests import Rest, StillSettings, rests
-from armcal.measure.tables import BLANKS, Columns, open_table
+from armcal.measure.tables import Columns, is_missing, is_number, open_table
 from pydantic import Field, model_validator
 
 Column = str | int  # A column's name in the header, or its number from 1
@@ -45,11 +43,6 @@ def read_columns(
         refuse(path, "found a header and no rows.", "Give a row a moment.", line)
     words = tuple(tuple(cell.strip() for cell in column) for column in read.texts)
     return replace(read, texts=words), names, table.sha256
-
-
-def cells_of(text: str, delimiter: str) -> list[str]:
-    parts = text.split() if delimiter == BLANKS else text.split(delimiter)
-    return [part.strip().strip('"').strip() for part in parts]
 
 
 def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
@@ -112,12 +105,13 @@ class ArmColumns(Settings):
         return np.ones(len(self.columns)) if self.gear_ratios is None else np.array(self.gear_ratios)
 
 
-class LogColumns(Settings):
-    """Which columns are whose, and whether a continuous log is reduced to its still moments.
+class TwoArmLogSettings(Settings):
+    """Which file, which columns are whose, and whether a continuous log is reduced to its still moments.
 
     ``time`` is the column of the time, ``labels`` maps names to text columns (``clamp: 16``).
     """
 
+    path: InputPath
     arms: Annotated[dict[str, ArmColumns], Field(min_length=1)]
     delimiter: Literal["auto", ",", ";", "\t", "|", " "] = "auto"
     time: Column | None = None
@@ -138,12 +132,6 @@ class LogColumns(Settings):
 
 
 _FULL_TURN = 2 * math.pi
-
-
-class TwoArmLogSettings(LogColumns):
-    """Which file, and what its columns are: see ``LogColumns``."""
-
-    path: InputPath
 
 
 class TwoArmLogReader:
@@ -195,8 +183,7 @@ class TwoArmLogReader:
                 self._refuse(text, hint, read.lines[first], names[channel])
         if times:
             values["time"] = from_unit(read.numbers[-1], s.time_unit)
-        dataset = with_absent(self._dataset(read, digest, joint_angles, values), request.channels)
-        return check_dataset(dataset, layout_of(request.channels, dataset, names, {}, by_line=True))
+        return read_as(self._dataset(read, digest, joint_angles, values), request, names)
 
     def _dataset(self, read: Columns, digest: str, joints: Array, values: Mapping[str, Array]) -> Dataset:
         """All rows, or the means of the rests among them."""

@@ -11,8 +11,3 @@ def armcal_register_measurements(register: Register) -> None:
 @hookimpl
 def armcal_register_readers(register: Register) -> None:
     register("two_arm_log", "armcal_dualarm.log_reader:TwoArmLogReader", "motor angles of several arms, perhaps a log")
-
-
-@hookimpl
-def armcal_register_joint_streams(register: Register) -> None:
-    register("two_arm_log", "armcal_dualarm.live:TwoArmLogStream", "motor angles of several arms, as they are logged")

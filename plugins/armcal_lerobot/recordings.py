@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import DataError, InputError, Location
-from armcal.io.cells import csv_text
 from armcal.io.plain_files import write_over
+from armcal.measure.csv_writer import csv_text
 from armcal.measure.rests import StillSettings, rests
 from armcal.plugins import library
 

@@ -8,7 +8,6 @@ from armcal.calibration.convert import urdf_text
 from armcal.calibration.exporter import POSES
 from armcal.calibration.rigid_chain import RigidChain, RigidJoint, turn_between
 from armcal.cli.common import FILE, Console, spare_inputs, speaking
-from armcal.errors import InputError
 from armcal.io.plain_files import check_output, input_bytes, text_of, write_new, write_over
 
 from armcal_makers.arms import MakersArm, at_zero, differences, read_kinematics, tips
@@ -28,7 +27,7 @@ def maker(console: Console, file: Path, out: Path | None, force: bool) -> None:
     """
     if out is not None:
         spare_inputs(out, file)
-        check_output(out, InputError)
+        check_output(out)
     text = text_of(input_bytes(file, _MAX_BYTES, "a maker's calibration"), file, "Save the file as UTF-8.")
     arm = read_kinematics(text, file)
     if out is not None:

@@ -18,11 +18,9 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _PURPOSE = "reading recordings of ROS 2"
 _MOST_DELAYS = 4096
-_FAR_S, _FEW = 10.0, 10
-"""A stamp that is so far from the others, by the time of receipt, is wrong; after so many at the begin, the others."""
-_ZERO, _SAME, _FAR = "the stamp zero", "the stamp of the one before", "a stamp far from those of others"
+_ZERO, _SAME = "the stamp zero", "the stamp of the one before"
 _EARLIER = "a stamp before that of an earlier one"
-_MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _FAR: 0.5, _EARLIER: 0.01})
+_MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01})
 """A larger part of the messages, and times are not to be trusted."""
 Clock = Literal["header", "receive"]
 
@@ -53,33 +51,20 @@ class Stamps:
         self.topic, self.count = topic, 0
         self.latest: float | None = None
         self._clock = clock
-        self._left = Counter[str]()
-        self._usual: float | None = None
+        self._faults = Counter[str]()
         self._delays = array("d")
 
     def time(self, stamp: int, received: int) -> float | None:
         """Seconds since 1970 (arguments in ns); None where it is missing, repeated or before an earlier one."""
         self.count += 1
         chosen = stamp if self._clock == "header" else received
-        time, delay = chosen / 1e9, (received - chosen) / 1e9
-        fault = ""
-        if not chosen:
-            fault = _ZERO
-        elif time == self.latest:
-            fault = _SAME
-        elif self._usual is not None and abs(delay - self._usual) > _FAR_S:
-            if self._left[_FAR] < _FEW or self.count > 2 * _FEW:
-                fault = _FAR
-            else:
-                self.latest = None  # the first were wrong, and these are right
-        if not fault and self.latest is not None and time < self.latest:
-            fault = _EARLIER
-        if fault:
-            self._left[fault] += 1
+        time, latest = chosen / 1e9, self.latest
+        if not chosen or (latest is not None and time <= latest):
+            self._faults[_ZERO if not chosen else _SAME if time == latest else _EARLIER] += 1
             return None
-        self.latest, self._usual = time, delay
+        self.latest = time
         if len(self._delays) < _MOST_DELAYS:
-            self._delays.append(delay)
+            self._delays.append((received - chosen) / 1e9)
         return time
 
     @property
@@ -93,12 +78,12 @@ class Stamps:
         Raises:
             DataError: stamps are zero, constant or backwards in too many messages.
         """
-        for cause, count in self._left.items():
+        for cause, count in self._faults.items():
             if count > max(_MOST[cause] * self.count, 1):
                 text = f"{count} of {self.count} messages of {self.topic} have {cause}, expected times of measurement."
                 hint = f"Set stamps: receive for {self.topic}, or give each program that publishes a topic of its own."
                 refuse(place, text, hint)
-        listed = ", ".join(f"{count} with {cause}" for cause, count in self._left.items())
+        listed = ", ".join(f"{count} with {cause}" for cause, count in self._faults.items())
         return [f"of {self.count} messages of {self.topic} some were left out: {listed}."] if listed else []
 
 
@@ -141,23 +126,29 @@ class Bag:
         self.path = path
         self.topics = Counter[Topic]()
         self.remarks: list[str] = []
-        self._files: list[Path] = []
-        self._parts = self._found()
+        self._files = [path]
+        if path.is_dir():
+            self._look_inside()
+        elif not path.exists():
+            refuse(path, "there is no such file or folder.", "Check the spelling and the directory.")
+        elif path.suffix not in _KINDS:
+            hint = "Convert it with rosbags-convert." if path.suffix == ".bag" else _EXPECTED
+            refuse(path, f"found the ending {path.suffix or 'none'}, expected .mcap or .db3.", hint)
 
     def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[Message]:
         """The messages of chosen topics, of each file by their time.
 
         Raises:
-            DataError: a file is no recording, or nothing of it can be read.
+            DataError: a file is no recording, or is cut off or damaged.
             PluginError: rosbags is not there.
         """
         rosbag2, typesys = (library(f"rosbags.{name}", _PURPOSE) for name in ("rosbag2", "typesys"))
-        types, unread, parts, count = typesys.get_typestore(typesys.Stores.LATEST), Counter[Topic](), [*self._parts], 0
+        types, unread = typesys.get_typestore(typesys.Stores.LATEST), Counter[Topic]()
         self.topics.clear()
-        while parts:
-            part = parts.pop(0)
+        for file in self._files:
+            count = 0
             try:
-                with rosbag2.Reader(part) as reader:
+                with rosbag2.Reader(file) as reader:
                     topics = {one.id: Topic(one.topic, one.msgtype) for one in reader.connections}
                     self.topics.update({topics[one.id]: one.msgcount for one in reader.connections})
                     chosen = [one for one in reader.connections if is_read(topics[one.id])]
@@ -170,15 +161,8 @@ class Bag:
                             continue
                         yield Message(topics[connection.id], received, bytes(data), content)
             except Exception as fault:  # of damaged files rosbags has no one error
-                if part.is_dir() and not count and self._files:
-                    self._remark(f"{_METADATA} cannot be used ({said(fault)}): files are read one by one.")
-                    self.topics.clear()
-                    parts = [*self._files]
-                    continue
-                text = f"it is cut off, damaged or no recording ({said(fault)})"
-                if not self.topics and not parts:
-                    refuse(part, f"{text}.", f"{_EXPECTED} {_RECOVER}")
-                self._remark(f"{part.name}: {text}; {count} messages were read. {_RECOVER}")
+                text = f"it is cut off, damaged or no recording, after {count} messages ({said(fault)})."
+                refuse(file, text, f"{_EXPECTED} {_RECOVER}")
         for topic, lost in unread.items():
             self._remark(f"{lost} messages of {topic.name} ({topic.type}) could not be decoded: left out.")
 
@@ -186,21 +170,8 @@ class Bag:
         if text not in self.remarks:
             self.remarks.append(text)
 
-    def _found(self) -> list[Path]:
-        """The folder, whose metadata.yaml names its files; without one, these in the order of their numbers."""
-        if not self.path.is_dir():
-            if not self.path.exists():
-                refuse(self.path, "there is no such file or folder.", "Check the spelling and the directory.")
-            if self.path.suffix not in _KINDS:
-                hint = "Convert it with rosbags-convert." if self.path.suffix == ".bag" else _EXPECTED
-                refuse(self.path, f"found the ending {self.path.suffix or 'none'}, expected .mcap or .db3.", hint)
-            return [self.path]
-
-        def natural(path: Path) -> list[tuple[int, str]]:
-            parts = re.split(r"(\d+)", path.name)
-            return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
-
-        self._files = sorted((file for file in self.path.iterdir() if file.suffix in _KINDS), key=natural)
+    def _look_inside(self) -> None:
+        """A folder's metadata.yaml names its files; without one, they are read in the order of their numbers."""
         for journal in self.path.glob("*.db3-wal"):
             if journal.stat().st_size:
                 self._remark(
@@ -208,8 +179,9 @@ class Bag:
                     f"sqlite3 {journal.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'."
                 )
         if (self.path / _METADATA).exists():
-            return [self.path]
-        if not self._files:
+            return
+        files = [file for file in self.path.iterdir() if file.suffix in _KINDS]
+        if not files:
             refuse(self.path, f"found no {_METADATA} and no file .mcap or .db3 in it.", _EXPECTED)
+        self._files = sorted(files, key=lambda file: [int(n) for n in re.findall(r"\d+", file.name)])
         self._remark(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
-        return self._files

@@ -1,7 +1,7 @@
 """The reader ``rosbag2``: records from a recording of ROS 2, one a rest of the arm."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
@@ -11,15 +11,13 @@ from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.io.plain_files import refuse
-from armcal.measure.checks import check_dataset, layout_of
-from armcal.measure.missing import with_absent
+from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
 from armcal.measure.rests import deviations_of_mean, judged, mean_pose
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from armcal_ros2.bag import JOINT_STATE, Bag, Topic
-from armcal_ros2.clock import estimated_offset
 from armcal_ros2.samples import (
     GUARD_S,
     MEASURED,
@@ -33,26 +31,12 @@ from armcal_ros2.samples import (
     channels_of,
 )
 
-NO_NOISE_M = 1e-5  # Smaller than what any arm errs by
 _FEWEST = 26  # Twice the numbers of an affine map of the tool's pose
 _MUCH_BETTER = 10.0  # So many times less is left of inverted poses
 
 
 def joint_channels(request: ReadRequest) -> list[str]:
     return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
-
-
-def tool_of(request: ReadRequest, name: str) -> Callable[[Array], Array]:
-    """The pose of the nominal tool that a measurement sees (N x 4 x 4, m) at the joints of all arms (N x joints)."""
-    own = request.measurements[name].arms[0]
-    arm, channels = request.arms[own], joint_channels(request)
-    columns = [channels.index(f"{own}.{joint}") for joint in arm.commanded]
-    return lambda joints: nominal_tools(arm, joints[:, columns])
-
-
-def follows(tools: Array, poses: Array) -> bool:
-    """Whether measured places (N x 4 x 4, m; nan where there are none) are those of a point on nominal tools."""
-    return _left(tools, poses) < NO_NOISE_M
 
 
 def is_inverted(tools: Array, poses: Array) -> bool:
@@ -74,7 +58,7 @@ def _left(tools: Array, poses: Array) -> float:
 
 
 _FEWEST_SAMPLES = 4
-_CLOCKS_APART_S, _DRIFT_S = 0.5, 0.01
+_CLOCKS_APART_S = 0.5
 _NAMED = 5
 _FULL_TURN = 2 * np.pi * (1 + 1e-9)
 
@@ -128,27 +112,22 @@ class Rosbag2Reader:
         if unknown:
             self._refuse(f"found measurements.{unknown[0]}, expected one of {have}.", "Correct the name.")
         self._digest = hashlib.sha256()
-        joints, paths = self._joints(bag, request)
+        joints = self._joints(bag, request)
         remarks = joints.close(str(s.path))
         rests = joints.rests
         self._refuse_degrees(request, np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest)
         if not rests:
             hint = "Let the arm stand at each pose, or give a wider spread_deg or a shorter window_s under still."
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
-        offsets = {}
-        for name in s.measurements:
-            offsets[name], more = self._offset(name, request, joints, paths.get(name))
-            remarks += more
-        logs = [MeasuredLog(name, own, rests, offsets[name]) for name, own in s.measurements.items()]
+        logs = [MeasuredLog(name, own, rests) for name, own in s.measurements.items()]
         self._follow(bag, logs)
         for log in logs:
             remarks += log.close(str(s.path)) + self._clock_remarks(log, joints)
         dataset = self._dataset(request, joints, logs, (*bag.remarks, *remarks))
-        dataset = with_absent(dataset, request.channels)
-        return check_dataset(dataset, layout_of(request.channels, dataset, {}, {}, by_line=False))
+        return read_as(dataset, request, by_line=False)
 
-    def _joints(self, bag: Bag, request: ReadRequest) -> tuple[JointLog, dict[str, MeasuredLog]]:
-        """The first time through: joints, and paths of measurements whose clock offset is to be estimated."""
+    def _joints(self, bag: Bag, request: ReadRequest) -> JointLog:
+        """The first time through: joints."""
         s = self._settings
         commanded = {name: arm.commanded for name, arm in request.arms.items()}
         names = channels_of(commanded, s.joints.names)
@@ -163,9 +142,8 @@ class Rosbag2Reader:
             self._refuse(f"found {twice[0]} for {both}, expected one joint of the recording each.", "Correct names.")
         slides = [kind == "length" for joints in commanded.values() for kind in joints.values()]
         log = JointLog(tuple(names.values()), slides, s.joints, s.still)
-        paths = {name: MeasuredLog(name, own) for name, own in s.measurements.items() if own.clock_offset == "estimate"}
-        self._follow(bag, list(paths.values()), log)
-        return log, paths
+        self._follow(bag, [], log)
+        return log
 
     def _follow(self, bag: Bag, logs: Sequence[MeasuredLog], joints: JointLog | None = None) -> None:
         """Once through the recording; each message goes to those that read its topic."""
@@ -199,41 +177,12 @@ class Rosbag2Reader:
             hint = "Give reference and frame: the pose of frame in reference is read."
         self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
 
-    def _offset(
-        self, name: str, request: ReadRequest, joints: JointLog, seen: MeasuredLog | None
-    ) -> tuple[float, list[str]]:
-        """How far a measurement's clock is ahead (s), with what is known of it."""
-        offset = self._settings.measurements[name].clock_offset
-        if seen is None or offset != "estimate":
-            assert not isinstance(offset, str)
-            return offset, []
-        seen.close(str(self._settings.path))
-        blocks, tool = request.measurements[name].parameters(), tool_of(request, name)
-        stated = {block.name: block.nominal[0] for block in blocks if len(block.nominal) == 1}
-        target = np.array([stated.get(f"target_{axis}", 0.0) for axis in "xyz"] + [1.0])
-
-        def place(moved: Array) -> Array:
-            return np.asarray((tool(moved) @ target)[:, :3])
-
-        guess = joints.stamps.delay - seen.stamps.delay
-        estimate = estimated_offset(joints.rests, joints.path(), seen.path(), place, guess)
-        if isinstance(estimate, str):
-            hint = f"State it, measurements: {{{name}: {{clock_offset_ms: 0}}}}, and let rests be longer than it."
-            self._refuse(f"the clock offset of {name} cannot be estimated: {estimate}.", hint)
-        width, count = 1000 * estimate.half_width, estimate.motions
-        text = f"the clock of {name} is {1000 * estimate.seconds:.2f} +- {width:.2f} ms ahead of that of the joints"
-        text += f" (95 %, from {count} motions)"
-        if abs(estimate.drift) > _DRIFT_S:
-            text += f"; it grew by {1000 * estimate.drift:.1f} ms during the recording: let rests be longer"
-        return estimate.seconds, [f"{text}."]
-
     def _clock_remarks(self, log: MeasuredLog, joints: JointLog) -> list[str]:
         apart = joints.stamps.delay - log.stamps.delay
-        stated = self._settings.measurements[log.instance].clock_offset
-        if isinstance(stated, str) or not abs(apart - stated) > _CLOCKS_APART_S:
+        if not abs(apart - log.offset) > _CLOCKS_APART_S:
             return []
         text = f"stamps of {log.settings.topic} are about {apart:.3g} s ahead of those of {joints.stamps.topic}"
-        return [f"{text}, by the times of receipt. Set clock_offset: estimate for {log.instance}."]
+        return [f"{text}, by the times of receipt. Set clock_offset_s: {apart:.3f} for {log.instance}."]
 
     def _dataset(
         self, request: ReadRequest, joints: JointLog, logs: Sequence[MeasuredLog], remarks: Sequence[str]
@@ -251,7 +200,7 @@ class Rosbag2Reader:
         extra["joint_scatter"] = tuple(f"{rest.scatter.max():.2g}" for rest in rests)
         for name, own in seen.items():
             channels |= self._measured(name, request, own)
-            remarks = [*remarks, *self._beside_nominal(tool_of(request, name)(means.T), name, own)]
+            self._refuse_inverted(request, name, channels, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)
         faulty = {}
@@ -266,7 +215,7 @@ class Rosbag2Reader:
         if faulty:
             listed = "; ".join(f"{ids[i]}: {reason}" for i, reason in list(faulty.items())[:_NAMED])
             text += f"; left out: {listed}" + (f"; and {len(faulty) - _NAMED} more" if len(faulty) > _NAMED else "")
-        remarks = [*remarks, *self._moving_remarks(seen)]
+        remarks = [*remarks, *self._moving_remarks(logs, joints, seen)]
         if len(faulty) == count:
             self._refuse(f"{text}.", " ".join(remarks) or "Let the arm stand where it is measured.")
         warnings = tuple(f"{place}: {remark}" for remark in (*remarks, f"{text}."))
@@ -274,33 +223,29 @@ class Rosbag2Reader:
         dataset = Dataset(ids, channels, extra, tuple(range(1, count + 1)), place, digest, warnings=warnings)
         return dataset.without(faulty)
 
-    def _beside_nominal(self, tools: Array, name: str, seen: Sequence[_Seen]) -> list[str]:
-        """A sentence on poses that the nominal tools (N x 4 x 4) have themselves.
-
-        Raises:
-            DataError: it is the inverses of the poses that move as the tools do.
-        """
-        poses = np.array([one.pose for one in seen])
-        if is_inverted(tools, poses):
+    def _refuse_inverted(
+        self, request: ReadRequest, name: str, channels: Mapping[str, Array], seen: Sequence[_Seen]
+    ) -> None:
+        """Refuse poses whose inverses move as the nominal tools do."""
+        own = request.measurements[name].arms[0]
+        joints = np.array([channels[f"{own}.{joint}"] for joint in request.arms[own].commanded]).T
+        if is_inverted(nominal_tools(request.arms[own], joints), np.array([one.pose for one in seen])):
             settings = self._settings.measurements[name]
             mend = f"Set inverted: {str(not settings.inverted).lower()} for {name}."
             text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm does"
             self._refuse(f"{text}.", mend if settings.reference is None else "Exchange frame and reference.")
-        if not follows(tools, poses):
-            return []
-        text = f"{name} follows the nominal arm to {1e6 * NO_NOISE_M:g} um: it seems to be computed from joints"
-        return [f"{text}, as robot_state_publisher does, and not measured."]
 
-    def _moving_remarks(self, seen: Mapping[str, Sequence[_Seen]]) -> list[str]:
+    def _moving_remarks(
+        self, logs: Sequence[MeasuredLog], joints: JointLog, seen: Mapping[str, Sequence[_Seen]]
+    ) -> list[str]:
         remarks = []
-        for name, own in seen.items():
-            moves = [bool(one.fault) for one in own if one.samples >= _FEWEST_SAMPLES]
+        for log in logs:
+            moves = [bool(one.fault) for one in seen[log.instance] if one.samples >= _FEWEST_SAMPLES]
             if 2 * sum(moves) > len(moves):
-                remark = f"{name} moves in {sum(moves)} of {len(moves)} rests of the joints."
-                remark += " It is on another arm, or not in m"
-                if self._settings.measurements[name].clock_offset != "estimate":
-                    remark += f"; or its clock is another: set clock_offset: estimate for {name}"
-                remarks.append(f"{remark}.")
+                apart = joints.stamps.delay - log.stamps.delay
+                remark = f"{log.instance} moves in {sum(moves)} of {len(moves)} rests of the joints. It is on another"
+                remark += f" arm, or not in m; or its clock is another: by the times of receipt it is {apart:.3f} s"
+                remarks.append(f"{remark} ahead, set clock_offset_s: {apart:.3f} for {log.instance}.")
         return remarks
 
     def _seen(self, log: MeasuredLog, place: int, rest: JointRest) -> _Seen:

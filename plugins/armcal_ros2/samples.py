@@ -1,4 +1,4 @@
-"""Measured positions and poses of a recording: messages of one topic, or of two frames of a tree of transforms."""
+"""Joints and measurements of a recording, message by message: rests, and what was measured in them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
@@ -15,17 +16,17 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.settings import Angle, Duration, Length, Settings
 from armcal.io.plain_files import refuse
-from armcal.measure.rests import LiveRests, Rows, StillSettings
+from armcal.measure.rests import StillSettings, rests
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from armcal_ros2.bag import Stamps, Topic, TopicSettings, nanoseconds
 
 GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
-_BLOCK = 1000
+_THINNED_S = 0.01  # Joints are kept so far apart: 25 MB for an hour of seven of them
 _LARGEST = 1e6  # No joint stands so far away, in any unit
-THINNED_S = 0.01
-MOST_THINNED = 400_000  # So many moments of the motion are kept, enough for an hour
+_JUMP, _MOST_RETURNS = 20.0, 0.1
+"""A larger part of messages that jump by so many spreads, to where the joints just were: two programs publish them."""
 
 
 class JointsSettings(TopicSettings):
@@ -65,43 +66,40 @@ class JointRest:
 
 
 class JointLog:
-    """Joint states as they come: rests, directions of motion, and a thinned path.
+    """Joint states as they come: rests, and directions of motion.
 
     Args:
         names: of the joints as the recording has them.
         slides: which of them slide.
-        settings: where they come from; rests: what rests are.
+        settings: where they come from; still: what rests are.
 
     Attributes:
         names: of the joints.
         topic: their topic; if none was stated, the first that has joint states.
-        rests: those that are over.
+        rests: complete once it is closed; shorter ones than a rest's window, to be listed, too.
         stamps: the times of the messages.
-        largest: absolute positions, by joint (rad or m).
-        gaps: begin and length of pauses of the messages that are longer than a rest's window (s).
+        largest: absolute positions, by joint (rad or m), once it is closed.
     """
 
     def __init__(
-        self, names: Sequence[str], slides: Sequence[bool], settings: JointsSettings, rests: RestSettings
+        self, names: Sequence[str], slides: Sequence[bool], settings: JointsSettings, still: RestSettings
     ) -> None:
-        self.names, self._settings = tuple(names), settings
-        self._limits = np.where(slides, rests.sliding_spread, rests.spread)
+        self.names = tuple(names)
+        self._limits = np.where(slides, still.sliding_spread, still.spread)
         self._scale = np.where(slides, 1.0, math.radians(1.0) if settings.unit == "deg" else 1.0)
-        self._window, self._settle = rests.window, rests.settle
+        self._window, self._settle = still.window, still.settle
         self._places: dict[tuple[str, ...], list[int]] = {}
-        # shorter pauses are found too, to be listed
-        self._live = LiveRests(StillSettings.si(window=rests.window / 2, spread=1.0))
-        self._times, self._rows = array("d"), list[Array]()
+        self._times, self._rows = array("d"), array("d")
         self._turned_at: list[tuple[float, Array]] = []
         self._furthest: Array | None = None
         self._direction = np.zeros(len(self.names))
-        self._path_times, self._path_rows = array("d"), array("f")
+        self._before: list[Array] = []  # where the joints were last, and where before that, apart
+        self._returns = 0
         self._lacking: Counter[str] = Counter()
         self._faulty = 0
         self.largest = np.zeros(len(self.names))
         self._seen: set[str] = set()
         self.rests: list[JointRest] = []
-        self.gaps: list[tuple[float, float]] = []
         self.topic = settings.topic
         self.stamps = Stamps(settings.topic or "", settings.stamps)
         self._others: set[str] = set()
@@ -122,15 +120,12 @@ class JointLog:
             if places:
                 self._lacking[next(name for name in self.names if name not in names)] += 1
             return
-        before = self.stamps.latest
         time = self.stamps.time(nanoseconds(message.header.stamp), received)
         if time is None:
             return
         if len(message.position) != len(names) or not (np.abs(row := message.position[places]) < _LARGEST).all():
             self._faulty += 1
             return
-        if before is not None and time - before > self._window:
-            self.gaps.append((before, time - before))
         self._take(time, row * self._scale)
 
     def close(self, place: str) -> list[str]:
@@ -139,8 +134,12 @@ class JointLog:
         Raises:
             DataError: nothing in it can be used.
         """
-        self._flush()
-        self.rests += [self._rest(rows) for rows in self._live.lasting()]
+        times, rows = np.array(self._times), np.array(self._rows).reshape(-1, len(self.names)).T
+        self.largest = np.abs(rows).max(axis=1, initial=0.0)
+        still = StillSettings.si(window=self._window / 2, spread=1.0)
+        for rest in rests(rows / self._limits[:, None], (), times, still):
+            part = slice(rest.start, rest.stop)
+            self.rests.append(self._rest(times[part], rows[:, part]))
         topic, count = self.topic, self.stamps.count
         if self._others or topic is None or not (self._seen or count):
             text = f"found {', '.join(sorted(filter(None, (topic, *self._others)))) or 'no topic'} with joint states"
@@ -156,15 +155,21 @@ class JointLog:
         if self._faulty == count:
             hint = "Repair the driver, or record again."
             refuse(place, f"none of {count} messages of {topic} has a finite position for each joint.", hint)
+        if self._returns > _MOST_RETURNS * count:
+            text = f"the joints of {topic} jump to and fro between two sets of values in {self._returns} of {count}"
+            hint = "Stop one of them, such as joint_state_publisher beside a controller, and record again."
+            refuse(place, f"{text} messages: two programs publish it.", hint)
         if self._lacking:
             (name, some), *_ = self._lacking.most_common()
             remarks.append(f"{some} messages of {topic} name some joints of the arm without {name}: left out.")
         if self._faulty:
             text = f"{self._faulty} of {count} messages of {topic} have positions that are missing or not finite"
             remarks.append(f"{text}: left out.")
-        if self.gaps:
-            begin, length = max(self.gaps, key=lambda gap: gap[1])
-            text = f"{topic} is silent {len(self.gaps)} times, for up to {length:.1f} s (from {begin:.2f})"
+        pauses = np.diff(times)
+        if (pauses > self._window).any():
+            longest = int(np.argmax(pauses))
+            text = f"{topic} is silent {(pauses > self._window).sum()} times, for up to {pauses[longest]:.1f} s"
+            text += f" (from {times[longest]:.2f})"
             remarks.append(f"{text}: a rest ends there.")
         return remarks
 
@@ -173,14 +178,14 @@ class JointLog:
         place = bisect_right(self._turned_at, time, key=lambda entry: entry[0])
         return self._turned_at[place - 1][1] if place else np.zeros(len(self.names))
 
-    def path(self) -> tuple[Array, Array]:
-        """Times (N, s) and joints (N x joints; rad or m) about every 10 ms, as long as memory allows."""
-        return np.array(self._path_times), np.array(self._path_rows, dtype=float).reshape(-1, len(self.names))
-
     def _take(self, time: float, row: Array) -> None:
-        self._times.append(time)
-        self._rows.append(row)
-        self.largest = np.maximum(self.largest, np.abs(row))
+        if self._before and (np.abs(row - self._before[0]) > _JUMP * self._limits).any():
+            self._returns += int((np.abs(row - self._before[-1]) <= self._limits).all())
+            self._before.insert(1, self._before[0])
+        self._before[:] = [row, *self._before[1:2]]
+        if not self._times or time - self._times[-1] >= _THINNED_S:
+            self._times.append(time)
+            self._rows.extend(row.tolist())
         if self._furthest is None:
             self._furthest = row
         moved = row - self._furthest
@@ -191,24 +196,11 @@ class JointLog:
             if (direction != self._direction).any():
                 self._turned_at.append((time, direction))
                 self._direction = direction
-        is_later = not self._path_times or time - self._path_times[-1] >= THINNED_S
-        if is_later and len(self._path_times) < MOST_THINNED:
-            self._path_times.append(time)
-            self._path_rows.frombytes(row.astype(np.float32).tobytes())
-        if len(self._rows) >= _BLOCK:
-            self._flush()
 
-    def _flush(self) -> None:
-        if self._rows:
-            rows = Rows(np.array(self._rows).T / self._limits[:, None], np.array(self._times), ())
-            self.rests += [self._rest(part) for part in self._live.add(rows)]
-        self._times, self._rows = array("d"), []
-
-    def _rest(self, rows: Rows) -> JointRest:
-        assert rows.time is not None
-        begin, end = float(rows.time[0]), float(rows.time[-1])
-        settled = (rows.time >= begin + self._settle) & (rows.time <= end - GUARD_S)
-        joints = (rows.joints[:, settled] if settled.any() else rows.joints) * self._limits[:, None]
+    def _rest(self, times: Array, rows: Array) -> JointRest:
+        begin, end = float(times[0]), float(times[-1])
+        settled = (times >= begin + self._settle) & (times <= end - GUARD_S)
+        joints = rows[:, settled] if settled.any() else rows
         return JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1))
 
 
@@ -244,15 +236,14 @@ class MeasuredSettings(TopicSettings):
     ``topic`` is one of PoseStamped, PointStamped or TransformStamped; ``frame`` is then the frame_id that its headers
     must have. Of transforms (``/tf``) the pose of ``frame`` in ``reference`` is read. With ``inverted`` poses are those
     of the instrument in the body, as of a marker that a camera on the hand sees, and their inverses are read.
-    ``clock_offset`` is how far the clock of its stamps is ahead of that of the joints; ``estimate`` finds it from the
-    motions between rests.
+    ``clock_offset`` is how far the clock of its stamps is ahead of that of the joints.
     """
 
     topic: str
     frame: str | None = None
     reference: str | None = None
     inverted: bool = False
-    clock_offset: Duration | Literal["estimate"] = 0.0
+    clock_offset: Duration = 0.0
 
     @model_validator(mode="after")
     def _both_frames(self) -> MeasuredSettings:
@@ -262,28 +253,22 @@ class MeasuredSettings(TopicSettings):
 
 
 class _Tree:
-    """The newest transforms, by child frame: parent, message and time (None: always)."""
+    """The newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)."""
 
     def __init__(self) -> None:
-        self.edges: dict[str, tuple[str, Any, float | None]] = {}
+        self.edges: dict[str, tuple[str, Array, float | None]] = {}
 
-    def way(self, reference: str, frame: str) -> tuple[list[str], list[str]] | None:
-        """The frames above a frame, itself first, and above another, as far as they are not the same; None without."""
+    def between(self, reference: str, frame: str) -> tuple[list[str], Array] | None:
+        """The frames on the way from one to another, and the pose of the latter in the former; None without a way."""
         above, beside = self._above(frame), self._above(reference)
-        shared = next((name for name in above if name in beside), None)
-        return None if shared is None else (above[: above.index(shared)], beside[: beside.index(shared)])
+        if above[-1] != beside[-1]:
+            return None
+        while above and beside and above[-1] == beside[-1]:  # what is above both does not matter
+            above.pop(), beside.pop()
+        return [*above, *beside], np.linalg.inv(self._pose(beside)) @ self._pose(above)
 
-    def pose(self, names: Sequence[str]) -> Array:
-        """Of the first frame in the parent of the last (4 x 4)."""
-        pose = np.eye(4)
-        for name in names:
-            moved = self.edges[name][1]
-            t, q = moved.translation, moved.rotation
-            step = np.eye(4)
-            step[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            step[:3, 3] = (t.x, t.y, t.z)
-            pose = step @ pose
-        return pose
+    def _pose(self, names: Sequence[str]) -> Array:
+        return reduce(lambda pose, name: self.edges[name][1] @ pose, names, np.eye(4))
 
     def _above(self, frame: str) -> list[str]:
         names = [frame]
@@ -293,30 +278,26 @@ class _Tree:
 
 
 class MeasuredLog:
-    """What a measurement saw, as messages come: in rests, or all along its path.
+    """What a measurement saw in rests, as messages come.
 
     Args:
         instance: the measurement's name.
         settings: where it comes from.
-        rests: in order; without any, its path is kept, thinned.
-        offset: how far its clock is ahead of that of the joints (s).
+        rests: in order.
 
     Attributes:
         stamps: the times of its messages.
         by_rest: samples (8 each: s, m, quaternion xyzw) of each rest, by its place.
     """
 
-    def __init__(
-        self, instance: str, settings: MeasuredSettings, rests: Sequence[JointRest] = (), offset: float = 0.0
-    ) -> None:
+    def __init__(self, instance: str, settings: MeasuredSettings, rests: Sequence[JointRest]) -> None:
         self.instance, self.settings = instance, settings
         self.stamps = Stamps(settings.topic, settings.stamps)
         self.by_rest: dict[int, array[float]] = {}
-        self._rests, self._begins, self.offset = rests, [rest.begin for rest in rests], offset
+        self._rests, self._begins, self.offset = rests, [rest.begin for rest in rests], settings.clock_offset
         self._tree = _Tree()
         self._frames: Counter[str] = Counter()
         self._faults: Counter[str] = Counter()
-        self._path = array("d")
         self._moved_at: float | None = None
 
     @property
@@ -375,11 +356,6 @@ class MeasuredLog:
             remarks.append(f"of {count} messages of {s.topic} some were left out: {listed}.")
         return remarks
 
-    def path(self) -> tuple[Array, Array]:
-        """Times (N, s, by its own clock) and positions (N x 3, m)."""
-        rows = np.array(self._path).reshape(-1, 8)
-        return rows[:, 0], rows[:, 1:4]
-
     def samples(self, rest: int) -> Array:
         """Those of a rest (N x 8: s, m, quaternion xyzw)."""
         return np.array(self.by_rest.get(rest, ()), dtype=float).reshape(-1, 8)
@@ -393,21 +369,23 @@ class MeasuredLog:
                 self._faults["quaternion is not of length 1"] += 1
                 continue
             at = (nanoseconds(part.header.stamp) if s.stamps == "header" else received) / 1e9
-            child = part.child_frame_id.lstrip("/")
-            self._tree.edges[child] = (part.header.frame_id.lstrip("/"), part.transform, None if is_static else at)
+            pose, place, child = np.eye(4), part.transform.translation, part.child_frame_id.lstrip("/")
+            pose[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            pose[:3, 3] = (place.x, place.y, place.z)
+            self._tree.edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
             changed.add(child)
-        way = self._tree.way((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
-        if way is None or changed.isdisjoint(names := [*way[0], *way[1]]):
+        way = self._tree.between((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
+        if way is None or changed.isdisjoint(way[0]):
             return
         # where several frames move, the oldest says when all of the pose was seen
-        times = (self._tree.edges[name][2] for name in names)
+        times = (self._tree.edges[name][2] for name in way[0])
         oldest = min((at for at in times if at is not None), default=None)
         if oldest is None or oldest == self._moved_at:
             return
         self._moved_at = oldest
         time = self.stamps.time(round(oldest * 1e9), received)
         if time is not None:
-            yield time, np.linalg.inv(self._tree.pose(way[1])) @ self._tree.pose(way[0])
+            yield time, way[1]
 
     def _take(self, time: float, position: Array, turn: Array | None) -> None:
         if not np.isfinite(position).all():
@@ -425,11 +403,6 @@ class MeasuredLog:
             inverse = Rotation.from_quat(turn).inv()
             position, turn = -inverse.apply(position), inverse.as_quat()
         sample = (time, *position.tolist(), *turn.tolist())
-        if not self._rests:
-            is_later = not self._path or time - self._path[-8] >= THINNED_S
-            if is_later and len(self._path) < 8 * MOST_THINNED:
-                self._path.extend(sample)
-            return
         place = bisect_right(self._begins, time - self.offset) - 1
         if place >= 0 and time - self.offset <= self._rests[place].end:
             kept = self.by_rest.setdefault(place, array("d"))

@@ -12,12 +12,11 @@ from armcal.base.settings import InputPath, Settings
 from armcal.base.units import DIMENSIONLESS, from_unit
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.errors import DataError, Location
-from armcal.io.cells import DECIMAL_COMMA, CellFault, read_cell, with_point
-from armcal.measure.checks import Layout, check_dataset, layout_of, require_records
+from armcal.measure.checks import read_as, require_records
 from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
-from armcal.measure.layout import set_aside, warned
+from armcal.measure.layout import Layout, set_aside, warned
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import Row, Table, open_table
+from armcal.measure.tables import DECIMAL_COMMA, CellFault, Row, Table, open_table, read_cell, with_point
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
@@ -67,7 +66,7 @@ class CsvReader:
             dataset = _load(table, header, plan, s.decimal == ",")
         names = {channel: column.name for channel, (column, _) in plan.channels.items()}
         units = {channel: unit for channel, (_, unit) in plan.channels.items()}
-        return check_dataset(dataset, layout_of(request.channels, dataset, names, units, by_line=True))
+        return read_as(dataset, request, names, units)
 
 
 def _refuse_delimiter(header: Header, delimiter: str, rows: Iterator[Row]) -> None:
@@ -267,17 +266,28 @@ class AnglesColumns(Orientation):
     def mapped(self) -> dict[str, str]:
         return dict(zip(TURNS, self.columns, strict=True))
 
+    def turned(self, values: Array, degrees: bool) -> Rotation:
+        """The rotations, in degrees or rad."""
+        return Rotation.from_euler("xyz", values, degrees=degrees)
+
+    def alternatives(self, values: Array, degrees: bool) -> dict[str, Rotation]:
+        """Other conventions, by what they are called."""
+        return {
+            "it as rotation_vector": Rotation.from_rotvec(values, degrees=degrees),
+            "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
+        }
+
     @override
     def rotations(self, values: Array) -> Rotation:
-        return Rotation.from_euler("xyz", values, degrees=self.unit == "deg")
+        return self.turned(values, self.unit == "deg")
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
         degrees = self.unit == "deg"
         return {
-            "it as rotation_vector": Rotation.from_rotvec(values, degrees=degrees),
-            "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
-            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler("xyz", values, degrees=not degrees),
+            **self.alternatives(values, degrees),
+            "it as that of body_T_base": self.rotations(values).inv(),
+            f"unit: {'rad' if degrees else 'deg'}": self.turned(values, not degrees),
         }
 
 
@@ -303,17 +313,13 @@ class EulerColumns(AnglesColumns):
         return f"order: {self.order} in {self.unit}"
 
     @override
-    def rotations(self, values: Array) -> Rotation:
-        return Rotation.from_euler(self.order, values, degrees=self.unit == "deg")
+    def turned(self, values: Array, degrees: bool) -> Rotation:
+        return Rotation.from_euler(self.order, values, degrees=degrees)
 
     @override
-    def others(self, values: Array) -> dict[str, Rotation]:
-        degrees, other = self.unit == "deg", self.order.swapcase()
-        return {
-            f"order: {other}": Rotation.from_euler(other, values, degrees=degrees),
-            "it as that of body_T_base": self.rotations(values).inv(),
-            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_euler(self.order, values, degrees=not degrees),
-        }
+    def alternatives(self, values: Array, degrees: bool) -> dict[str, Rotation]:
+        other = self.order.swapcase()
+        return {f"order: {other}": Rotation.from_euler(other, values, degrees=degrees)}
 
 
 class VectorColumns(AnglesColumns):
@@ -327,17 +333,12 @@ class VectorColumns(AnglesColumns):
         return f"the rotation vector of base_T_body in {self.unit}"
 
     @override
-    def rotations(self, values: Array) -> Rotation:
-        return Rotation.from_rotvec(values, degrees=self.unit == "deg")
+    def turned(self, values: Array, degrees: bool) -> Rotation:
+        return Rotation.from_rotvec(values, degrees=degrees)
 
     @override
-    def others(self, values: Array) -> dict[str, Rotation]:
-        degrees = self.unit == "deg"
-        return {
-            "it as rpy": Rotation.from_euler("xyz", values, degrees=degrees),
-            "it as that of body_T_base": self.rotations(values).inv(),
-            f"unit: {'rad' if degrees else 'deg'}": Rotation.from_rotvec(values, degrees=not degrees),
-        }
+    def alternatives(self, values: Array, degrees: bool) -> dict[str, Rotation]:
+        return {"it as rpy": Rotation.from_euler("xyz", values, degrees=degrees)}
 
 
 def reflections(values: Array) -> Array:

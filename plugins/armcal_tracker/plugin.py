@@ -21,4 +21,3 @@ def armcal_register_trackers(register: Register) -> None:
     register(
         "json_lines", "armcal_tracker.line_trackers:JsonLinesTracker", "a JSON object a line: UDP, or a growing file"
     )
-    register("csv", "armcal_tracker.line_trackers:GrowingCsvTracker", "a table of frames in a growing file")

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.base.units import from_unit
-from armcal.errors import EXIT_BAD_INPUT, DataError, Location
+from armcal.errors import EXIT_BAD_INPUT, DataError, InputError, Location
 from armcal.measure import checks
-from armcal.measure.checks import Layout, check_dataset, layout_of, refuse_joint_count
+from armcal.measure.checks import check_dataset, refuse_joint_count, set_aside_not_finite
 from armcal.measure.csv_writer import column_names, write_csv
+from armcal.measure.layout import Layout, layout_of
 from armcal.measure.reader import RequestedChannel
 from numpy.typing import NDArray
 
@@ -106,7 +107,7 @@ def test_rows_are_named_as_rows_unless_they_are_lines() -> None:
 
 def test_missing_and_infinite_values_are_set_aside() -> None:
     dataset = records(tracker_x=[1, np.nan, 3, 4, np.inf, 6, 7, 8], arm_q1=[0, np.nan, 1, 1, 1, 1, 1, 1])
-    kept = checks.set_aside_not_finite(dataset, layout())
+    kept = set_aside_not_finite(dataset, layout())
     assert kept.ids == ("p0", "p2", "p3", "p5", "p6", "p7")
     assert [(a.row, a.record_id) for a in kept.set_aside] == [(3, "p1"), (6, "p4")]
     assert kept.set_aside[0].reason == "q1_deg is empty or NaN, tracker.x is empty or NaN"
@@ -305,7 +306,7 @@ def test_writing_replaces_whole_or_not_at_all(tmp_path: Path) -> None:
     write_csv(target, Dataset(("1",), {"arm.q1": np.array([1.0])}), WANTED, {"angle": "rad"})
     assert target.read_text() == "pose_id,q1_rad\n1,1.0\n"
     assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
-    with pytest.raises(DataError, match=r"cannot be written.*Check that its folder"):
+    with pytest.raises(InputError, match=r"cannot be written.*in a folder that is there"):
         write_csv(tmp_path / "none" / "out.csv", Dataset((), {}), WANTED)
     with pytest.raises(ValueError, match="expected one of rad, deg, mrad"):
         column_names(WANTED, {"angle": "mm"})

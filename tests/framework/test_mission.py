@@ -45,14 +45,12 @@ EVENTS, EARLY = (
     yaml.safe_dump(events, default_flow_style=True, width=10_000).strip()
     for events in ([SLIP, SWAP, BUMP], [{**SLIP, "day": 0.3}])
 )
-REFIT = "{records: 60, every: 100}"
 SHORT = (
     "simulation.days=3",
     "simulation.records.every_min=20",
     f"simulation.events={EVENTS}",
     "simulation.power_cuts=[0.7, 1.55]",
     "mission.poses=20",
-    f"mission.refit={REFIT}",
 )
 ONE_DAY = (
     *SHORT,
@@ -302,7 +300,7 @@ def test_the_recalibration_goes_on_after_power_cuts_and_sees_every_record(
 def test_power_cuts_change_nothing(short: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """To the last digit of every error at every moment: the journal is all that a restart needs."""
     folder, _ = short
-    calibration = f"mission={{calibration: {folder / 'calibration.yaml'}, poses: 20, refit: {REFIT}}}"
+    calibration = f"mission={{calibration: {folder / 'calibration.yaml'}, poses: 20}}"
     again, told = flown(tmp_path / "out", *SHORT, "simulation.power_cuts=[]", calibration)
     assert told["resumed"] == 0
     assert (again / "mission.csv").read_bytes() == (folder / "mission.csv").read_bytes()
@@ -317,8 +315,7 @@ def test_the_recalibrated_arm_is_better_than_the_frozen_one(days: str, request: 
     loaded = MissionPlan.load(CONFIG, SHORT if days == "short" else ONE_DAY)
     found, _ = verdicts(occurrences(loaded.simulator._settings.events, told["days"]), told["decisions"])
     assert found[0] == "right" and slip["decision"] in ("joint_slipped", "joint_named")
-    if days == "short":  # one day is too short for a refit
-        assert set(told["error_mm"]) == {"frozen", "refit", "refit_recent", "recalibrated"}
+    assert set(told["error_mm"]) == {"frozen", "recalibrated"}
 
 
 def test_records_of_the_mission_are_what_was_simulated(one_day: tuple[Path, dict[str, Any]]) -> None:

@@ -12,8 +12,10 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.estimate.robust import reweighted
 from armcal.problem.problem import Problem
-from armcal_online.mission.mission import MissionLog, MissionPlan, Series, error_curve, refits, robust_fit
+from armcal_online.mission.mission import MissionLog, MissionPlan, Series, error_curve
 from armcal_online.mission.simulator import DAY_S, Mission, with_payload
+
+from tests.mission_refits import refits, robust_fit
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"
 SLIP = "{kind: slip, day: 1, joint: arm.q3, changes: {arm.mdh.theta3: 5 deg}}"
@@ -23,7 +25,6 @@ SETTINGS = (
     f"simulation.events=[{SLIP}]",
     "simulation.outliers={fraction: 0.2, size_mm: 30, largest_mm: 500}",
     "simulation.power_cuts=[]",
-    "mission.refit={records: 20, every: 30}",
 )
 
 
@@ -58,7 +59,7 @@ def before_the_slip() -> Array:
 
 @lru_cache
 def series() -> dict[str, Series]:
-    return refits(plan(), at_launch(), mission())
+    return refits(plan(), at_launch(), mission(), 20, 30)
 
 
 @pytest.mark.slow
@@ -112,5 +113,4 @@ def test_a_calibration_that_holds_the_arm_in_no_pose_is_as_far_off_as_the_tips_l
 
 
 def test_too_few_records_make_no_refit() -> None:
-    many = MissionPlan.load(CONFIG, (*SETTINGS, "mission.refit.records=999"))
-    assert refits(many, at_launch(), mission()) == {}
+    assert refits(plan(), at_launch(), mission(), 999) == {}

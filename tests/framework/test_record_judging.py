@@ -126,35 +126,3 @@ def test_all_at_once_gives_what_one_after_the_other_gives() -> None:
     fitter = QuickFitter(experiment.of_records(dataset), dict(experiment.system.measurements), dataset)
     groups = ["/".join(each) for each in zip(dataset.extra["position"], dataset.extra["socket"], strict=True)]
     assert set(AgreementJudge(fitter, groups).anew().doubtful) == {4, 22} == judged({4: 0.4, 22: 0.4}, 30)[1]
-
-
-@pytest.mark.slow
-def test_two_arms_from_their_log_rest_by_rest(tmp_path: Path) -> None:
-    """The log of Frida's motors, streamed, gives the records that reading it gives; a clamp that slipped is told."""
-    config = DEMO.parents[1] / "frida" / "dual_known_clamp.yaml"
-    known = Experiment.load(config).read().subset(range(12))
-    channels = [f"{side}.q{i}" for side in ("left", "right") for i in range(1, 8)]
-    angles = known.stacked(channels)
-    angles[3, 9] += np.radians(0.5)
-    source, lines = np.random.default_rng(2), []
-    for here, there in zip(angles.T, [*angles.T[1:], angles.T[-1]], strict=True):
-        rest = [here + 1e-6 * source.uniform(-1, 1, 14) for _ in range(30)]
-        lines += [*rest, *[here + (there - here) * step / 10 for step in range(1, 10)]]
-    text = "".join(" ".join(repr(float(100 * angle)) for angle in line) + "\n" for line in lines)
-    sides = {"left": range(1, 8), "right": range(8, 15)}
-    columns = {name: {"columns": list(own), "gear_ratios": [100] * 7} for name, own in sides.items()}
-    joints = {"type": "two_arm_log", "arms": columns, "still": {"samples": 20, "spread_deg": 0.01}}
-    asked = ("--set", f"bench.joints={json.dumps(joints)}", "--json")
-    out, log = tmp_path / "out", tmp_path / "clamped.log"
-    done = command("record", config, "--out", out, "--from", "-", "--capture", "still", *asked, given=text)
-    assert done.returncode == 0, done.stderr
-    rows = recorded(out)
-    found = np.array([[float(row[f"{channel}_deg"]) for channel in channels] for row in rows])
-    log.write_text(text)
-    reader = yaml.safe_dump({**joints, "path": str(log)}, default_flow_style=True, width=10_000).strip()
-    read = command("check", config, "--set", f"data={reader}", "--json")
-    assert "reduced to 12 still moments" in read.stdout + read.stderr
-    np.testing.assert_allclose(np.radians(found), angles.T, rtol=0, atol=1e-6)
-    assert [row["pose_id"] for row in rows if row["doubt"]] == ["10"]
-    refused = command("record", config, "--out", tmp_path / "b", "--from", "udp:0", *asked, given="")
-    assert refused.returncode == 2 and "no key can capture one" in refused.stdout + refused.stderr

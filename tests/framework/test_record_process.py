@@ -232,7 +232,7 @@ class GuidedStep:
     ("more", "said"),
     [
         (("--from", "udp:99999"), "expected - (standard input), udp:PORT"),
-        (("--from", "udp:0.0.0.0:0"), "other machines reach this address, and no sender is named"),
+        (("--from", "udp:0.0.0.0:9000"), "expected - (standard input), udp:PORT of this machine"),
         (("--from", "/no/such/file"), "no joint readings come"),
         ((), "found no bench"),
         (("--from", "udp:0", "--set", "bench.joints={type: json_lines, joints: {j9: x}}"), "no joint is called 'j9'"),

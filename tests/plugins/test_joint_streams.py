@@ -1,4 +1,4 @@
-"""Live joint readings: JSON lines in their forms, logs of two arms, the sources they come from, and what is refused."""
+"""Live joint readings: JSON lines in their forms, the sources they come from, and what is refused."""
 
 from __future__ import annotations
 
@@ -8,21 +8,11 @@ import os
 import socket
 from pathlib import Path
 
-import numpy as np
 import pytest
-from armcal.arm.assembly import Arm
-from armcal.devices.live import RestStream
 from armcal.errors import ConfigError, InputError
-from armcal.measure.reader import ReadRequest, requested_channels
-from armcal.measure.rests import LiveRests, Rows, StillSettings, rests
 from armcal_contact.json_joints import JsonLinesJoints, JsonLinesJointSettings
-from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
-from armcal_dualarm.live import TwoArmLogStream, TwoArmStreamSettings
-from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
-from armcal_mdh.model import MdhModel, MdhSettings
 
 CHANNELS = ("arm.j1", "arm.j2")
-ORDER, RATIOS = [1, 2, 7, 3, 4, 5, 6], [100, 100, -100, 100, -101, 100, 100]
 
 
 class Stopped:
@@ -194,130 +184,3 @@ def test_a_source_that_is_not_there_is_refused(source):
     with pytest.raises((InputError, ValueError)) as caught:
         JsonLinesJoints(JsonLinesJointSettings(source=source)).open(Stopped(), CHANNELS)
     assert "cannot" in str(caught.value) or "read line by line" in str(caught.value) or "path" in str(caught.value)
-
-
-def sides(**more):
-    columns = {"left": list(range(1, 8)), "right": list(range(8, 15))}
-    return {side: {"columns": own, "order": ORDER, "gear_ratios": RATIOS, **more} for side, own in columns.items()}
-
-
-BOTH = tuple(f"{side}.q{i}" for side in ("left", "right") for i in range(1, 8))
-
-
-def motors(angles):
-    table = np.empty_like(angles)
-    for side in (0, 7):
-        for from_base, (own, ratio) in enumerate(zip(ORDER, RATIOS, strict=True)):
-            table[:, side + own - 1] = angles[:, side + from_base] * ratio
-    return table
-
-
-def guided_log(rests_count, seed):
-    """Rows of a log (time ms, 14 motors, clamp) with rests of various lengths, motions, pauses and changes of label."""
-    random = np.random.default_rng(seed)
-    stand, rows, at = random.uniform(-1.5, 1.5, 14), [], 0.0
-    for number in range(rests_count):
-        for _ in range(int(random.integers(5, 60))):
-            at += 20.0
-            rows.append((at, stand + 1e-5 * random.uniform(-1, 1, 14), f"c{number // 3}"))
-        at += 3000.0 * (random.uniform() < 0.2)
-        to = random.uniform(-1.5, 1.5, 14)
-        count = int(random.integers(1, 20))
-        for step in range(1, count):
-            at += 20.0
-            rows.append((at, stand + (to - stand) * step / count, f"c{number // 3}"))
-        stand = to
-    angles = motors(np.array([row[1] for row in rows]))
-    return [
-        ";".join([repr(row[0]), *(repr(float(x)) for x in own), row[2]]) for row, own in zip(rows, angles, strict=True)
-    ]
-
-
-def two_arms():
-    model = MdhSettings.si(convention="standard", rows=[{"a": 0.1, "alpha": 1.0}] * 7)
-    arms = {name: Arm(name, "mdh", MdhModel(model), {}, ()) for name in ("left", "right")}
-    clamp = {"clamp": ClosedChain(ClosedChainSettings.si(noise=1e-4, orientation_noise=1e-3), tuple(arms))}
-    return ReadRequest(arms, clamp, requested_channels(arms, clamp, measured=True))
-
-
-@pytest.mark.quick("0-still1")
-@pytest.mark.parametrize("still", [{"samples": 15}, {"window_s": 0.3, "spread_deg": 0.01}])
-@pytest.mark.parametrize("seed", range(4))
-def test_a_log_streamed_live_gives_the_records_that_reading_it_gives(tmp_path, still, seed):
-    lines = guided_log(25, seed)
-    header = ";".join(["ms", *(f"m{i}" for i in range(14)), "clamp"])
-    named = {"left": [f"m{i}" for i in range(7)], "right": [f"m{i}" for i in range(7, 14)]}
-    arms = {side: {**own, "columns": named[side]} for side, own in sides().items()}
-    settings = {"arms": arms, "time": "ms", "time_unit": "ms", "labels": {"clamp": "clamp"}, "still": still}
-    whole = tmp_path / "whole.log"
-    whole.write_text("\n".join([header, *lines]) + "\n")
-    read = TwoArmLogReader(TwoArmLogSettings(path=whole, **settings)).read(two_arms())
-    growing = tmp_path / "growing.log"
-    growing.touch()
-    stream = TwoArmLogStream(TwoArmStreamSettings(source=str(growing), begin="start", **settings))
-    assert isinstance(stream, RestStream) and stream.gives_rests
-    stream.open(Stopped(), BOTH)
-    random, samples, data, at = np.random.default_rng(seed), [], whole.read_bytes(), 0
-    while at < len(data):
-        size = int(random.integers(1, 40_000))
-        with growing.open("ab") as file:
-            file.write(data[at : at + size])
-        at += size
-        samples += stream.samples()
-    samples += [*stream.lasting(), *stream.lasting()]
-    assert len(samples) == len(read) > 10 and stream.refused == {}
-    for i, sample in enumerate(samples):
-        assert [sample.angles[c] for c in BOTH] == pytest.approx([read.column(c)[i] for c in BOTH], rel=1e-12)
-        assert sample.stamp == pytest.approx(read.column("time")[i], rel=1e-12)
-        assert sample.labels == {"clamp": read.extra["clamp"][i]}
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_rests_found_in_pieces_are_those_of_the_whole(seed):
-    random = np.random.default_rng(seed)
-    steps = random.normal(size=(3, 300)) * random.choice([0.0, 0.02, 1.0], 300, p=[0.7, 0.25, 0.05])
-    log = np.cumsum(steps, axis=1)
-    log[1, random.uniform(size=300) < 0.01] = np.nan
-    labels = tuple("ab"[int(i)] for i in np.cumsum(random.uniform(size=300) < 0.02) % 2)
-    time = np.cumsum(random.choice([0.01, 0.0, 0.5, -0.2], 300, p=[0.9, 0.06, 0.02, 0.02]))
-    by_samples = StillSettings.si(samples=int(random.integers(2, 20)), spread=0.1)
-    for settings in (by_samples, StillSettings.si(window=0.08, spread=0.1)):
-        live, found, at = LiveRests(settings), [], 0
-        while at < 300:
-            stop = min(300, at + int(random.integers(1, 40)))
-            found += live.add(Rows(log[:, at:stop], time[at:stop], (labels[at:stop],)))
-            at = stop
-        found += live.lasting()
-        expected = [log[:, rest.start : rest.stop] for rest in rests(log, (labels,), time, settings)]
-        assert len(found) == len(expected)
-        for one, other in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(one.joints, other)
-
-
-def test_without_still_each_row_is_a_reading_whatever_parts_the_cells(tmp_path):
-    path = tmp_path / "log"
-    angles = np.random.default_rng(1).uniform(-2, 2, (5, 14))
-    path.write_text("m " * 13 + "m\n")  # its header; what is in the file already is not live
-    stream = TwoArmLogStream(TwoArmStreamSettings(source=str(path), arms=sides()))
-    stream.open(Stopped(), BOTH)
-    for row in motors(angles):
-        append(path, "  ".join(map(repr, row.tolist())))
-    append(path, "1 2 3", "x " * 14, " ".join(["1"] * 13 + ["nan"]), "m " * 14)
-    samples = stream.samples()
-    assert np.array([list(s.angles.values()) for s in samples]) == pytest.approx(angles)
-    reasons = stream.refused
-    assert reasons["found 3 cells, expected 14 as in the first row"] == 1
-    assert any("expected a number" in reason for reason in reasons)
-    assert reasons["it has no reading of right.q3"] == 1 and sum(reasons.values()) == 3
-
-
-def test_other_arms_or_counts_are_refused_when_it_is_opened(tmp_path):
-    path = tmp_path / "log"
-    path.touch()
-    for arms, said in (
-        ({"left": {"columns": [1, 2]}}, "found 2 columns for the arm left, which has 7 joints"),
-        ({"left": sides()["left"]}, "found 0 columns for the arm right, which has 7 joints"),
-        ({**sides(), "middle": {"columns": [20]}}, "no arm is called 'middle'; the arms are left, right"),
-    ):
-        with pytest.raises(ConfigError, match=said):
-            TwoArmLogStream(TwoArmStreamSettings(source=str(path), arms=arms)).open(Stopped(), BOTH)

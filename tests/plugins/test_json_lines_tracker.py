@@ -1,4 +1,4 @@
-"""Trackers that speak JSON or write a table: datagrams, files that grow, are cut and replaced, and what is refused."""
+"""Trackers that speak JSON: datagrams, files that grow, are cut and replaced, and what is refused."""
 
 from __future__ import annotations
 
@@ -11,21 +11,10 @@ import numpy as np
 import pytest
 from armcal.devices.clock import RealClock
 from armcal.devices.device import DeviceRefusedError
-from armcal.errors import DataError
 from armcal_tracker.frames import UnreadableError
-from armcal_tracker.line_trackers import (
-    GrowingCsvSettings,
-    GrowingCsvTracker,
-    JsonLinesSettings,
-    JsonLinesTracker,
-    frame_table,
-    json_frame,
-    row_of,
-)
+from armcal_tracker.line_trackers import JsonLinesSettings, JsonLinesTracker, json_frame
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-
-HEADER = "frame,t_s,tool_x_mm,tool_y_mm,tool_z_mm,tool_qw,tool_qx,tool_qy,tool_qz,base_x_m,base_y_m,base_z_m\n"
 
 
 def line(counter: int, **bodies: object) -> bytes:
@@ -33,24 +22,15 @@ def line(counter: int, **bodies: object) -> bytes:
     return json.dumps(content).encode() + b"\n"
 
 
-def row(counter: int) -> str:
-    return f"{counter},{counter / 10},1,2,3,1,0,0,0,0.1,0.2,0.3\n"
-
-
-def growing(path: Path, **settings: object) -> JsonLinesTracker | GrowingCsvTracker:
-    chosen = {"path": path, **settings}
-    tracker: JsonLinesTracker | GrowingCsvTracker = (
-        GrowingCsvTracker(GrowingCsvSettings.model_validate(chosen))
-        if path.suffix == ".csv"
-        else JsonLinesTracker(JsonLinesSettings.model_validate(chosen))
-    )
+def growing(path: Path, **settings: object) -> JsonLinesTracker:
+    tracker = JsonLinesTracker(JsonLinesSettings.model_validate({"path": path, **settings}))
     tracker.open(RealClock())
     return tracker
 
 
-def append(path: Path, data: str | bytes) -> None:
+def append(path: Path, *data: bytes) -> None:
     with path.open("ab") as file:
-        file.write(data.encode() if isinstance(data, str) else data)
+        file.writelines(data)
 
 
 def test_a_frame_of_json() -> None:
@@ -118,17 +98,15 @@ def test_what_is_no_frame(text: str) -> None:
 def test_no_line_is_an_exception_and_reasons_are_few() -> None:
     source = random.Random(1)
     good, reasons = line(3, tool={"p_mm": [1, 2, 3], "q": [1, 0, 0, 0]}), set()
-    table = frame_table(HEADER, "a")
     for _ in range(10_000):
-        for text, read in ((good, json_frame), (row(4).encode().strip(), lambda data: row_of(table, data))):
-            data = bytearray(text)
-            for _ in range(source.randrange(1, 5)):
-                at = source.randrange(len(data) + 1)
-                data[at : at + source.randrange(4)] = source.choice((b"", b"9e99", b'"', b"{", source.randbytes(2)))
-            try:
-                read(bytes(data))
-            except UnreadableError as fault:
-                reasons.add(str(fault))
+        data = bytearray(good)
+        for _ in range(source.randrange(1, 5)):
+            at = source.randrange(len(data) + 1)
+            data[at : at + source.randrange(4)] = source.choice((b"", b"9e99", b'"', b"{", source.randbytes(2)))
+        try:
+            json_frame(bytes(data))
+        except UnreadableError as fault:
+            reasons.add(str(fault))
     assert len(reasons) < 30
 
 
@@ -153,37 +131,33 @@ def test_bad_settings(settings: dict[str, object]) -> None:
         JsonLinesSettings.model_validate(settings)
 
 
-@pytest.fixture(params=["frames.jsonl", "frames.csv"])
-def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    made = tmp_path / request.param
-    made.write_text(HEADER if made.suffix == ".csv" else "")
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    made = tmp_path / "frames.jsonl"
+    made.touch()
     return made
 
 
-def text(path: Path, counter: int) -> str:
-    return row(counter) if path.suffix == ".csv" else line(counter).decode()
-
-
 def test_only_what_comes_after_opening_counts(path: Path) -> None:
-    append(path, text(path, 1) + text(path, 2))
+    append(path, line(1), line(2))
     tracker = growing(path)
     assert tracker.frames() == []
-    append(path, text(path, 3))
+    append(path, line(3))
     [found] = tracker.frames()
     assert found.counter == 3 and found.stamp == pytest.approx(0.3)
     np.testing.assert_allclose(found.bodies["tool"][:3, 3], [0.001, 0.002, 0.003])  # type: ignore[index]
 
 
 def test_all_of_it_counts_where_that_is_asked_for(path: Path) -> None:
-    append(path, text(path, 1) + text(path, 2))
+    append(path, line(1), line(2))
     assert [f.counter for f in growing(path, begin="start").frames()] == [1, 2]
 
 
 def test_a_torn_line_waits_for_its_end(path: Path) -> None:
-    begun = text(path, 1)
+    begun = line(1)
     append(path, begun[:8])
     tracker = growing(path)
-    rest = begun[8:] + text(path, 2)
+    rest = begun[8:] + line(2)
     found = []
     for i in range(0, len(rest), 7):
         append(path, rest[i : i + 7])
@@ -194,88 +168,33 @@ def test_a_torn_line_waits_for_its_end(path: Path) -> None:
 def test_a_file_that_is_cut_or_replaced_is_read_from_its_start(path: Path) -> None:
     tracker = growing(path)
     for counter in (10, 11, 12, 13):
-        append(path, text(path, counter))
+        append(path, line(counter))
     assert len(tracker.frames()) == 4
-    header = HEADER if path.suffix == ".csv" else ""
-    path.write_text(header)
+    path.write_text("")
     tracker.frames()
-    append(path, text(path, 1))
+    append(path, line(1))
     assert [f.counter for f in tracker.frames() + tracker.frames()] == [1]
     other = path.with_name("other")
-    other.write_text(header + text(path, 1) + text(path, 2))
+    other.write_bytes(line(1) + line(2))
     other.replace(path)
     assert [f.counter for f in tracker.frames() + tracker.frames()] == [1, 2]
     path.unlink()
     assert tracker.frames() == []
-    path.write_text(header + text(path, 1))
+    path.write_bytes(line(1))
     assert [f.counter for f in tracker.frames() + tracker.frames()] == [1]
 
 
 def test_long_lines_and_noise_are_counted(path: Path) -> None:
     tracker = growing(path)
-    append(path, b"x" * 200_000 + b"\n" + b"\xff\xfe,\n\n" + text(path, 5).encode())
+    append(path, b"x" * 200_000 + b"\n" + b"\xff\xfe,\n\n" + line(5))
     assert [f.counter for f in tracker.frames()] == [5]
     assert sum(tracker.refused.values()) == 2
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
-    for name in ("gone.csv", "gone.jsonl"):
-        with pytest.raises(DeviceRefusedError, match="gone"):
-            growing(tmp_path / name)
-    folder = tmp_path / "folder.csv"
+    with pytest.raises(DeviceRefusedError, match="gone"):
+        growing(tmp_path / "gone.jsonl")
+    folder = tmp_path / "folder"
     folder.mkdir()
     with pytest.raises(DeviceRefusedError, match="not a regular file"):
         growing(folder)
-
-
-def test_a_header_may_come_later(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("")
-    tracker = growing(path)
-    append(path, HEADER[:20])
-    assert tracker.frames() == []
-    append(path, HEADER[20:] + row(1))
-    assert [f.counter for f in tracker.frames()] == [1]
-
-
-def test_columns_of_bodies() -> None:
-    table = frame_table("frame;t_ms;x_mm;y_mm;z_cm;left_arm_x_m;left_arm_y_m;left_arm_z_m;note", "a.csv")
-    found = row_of(table, b"4;250;1;2;3;;;;hello")
-    assert found is not None and found.stamp == pytest.approx(0.25)
-    np.testing.assert_allclose(found.bodies["tool"][:3, 3], [0.001, 0.002, 0.03])  # type: ignore[index]
-    assert found.bodies["left_arm"] is None
-    assert row_of(table, ";".join(table.cells).encode()) is None
-
-
-def test_orientations_in_a_table() -> None:
-    table = frame_table(HEADER.strip(), "a.csv")
-    turned = row_of(table, b"1,0,1,2,3,0,1,0,0,1,2,3")
-    missing = row_of(table, b"1,0,1,2,3,,,,,1,2,3")
-    wrong = row_of(table, b"1,0,1,2,3,0.5,0,0,0,1,2,3")
-    assert turned is not None and missing is not None and wrong is not None
-    np.testing.assert_allclose(turned.bodies["tool"][:3, :3], np.diag([1, -1, -1]))  # type: ignore[index]
-    assert np.isnan(missing.bodies["tool"][0, 0])  # type: ignore[index]
-    assert wrong.bodies["tool"] is None and len(wrong.wrong) == 1
-    for cells in (b"1,0,1,2", b"x,0,1,2,3,1,0,0,0,1,2,3", b"1,0,inf,2,3,1,0,0,0,1,2,3", b'1,"0,1'):
-        with pytest.raises(UnreadableError):
-            row_of(table, cells)
-
-
-@pytest.mark.parametrize(
-    ("header", "why"),
-    [
-        ("t,x_mm,y_mm,z_mm", "no column frame"),
-        ("frame,x,y,z", "no column of positions"),
-        ("frame,x_mm,y_mm", "no z"),
-        ("frame,x_mm,y_mm,z_mm,qw", "1 columns of the quaternion"),
-        ("frame,x_mm,x_mm,y_mm,z_mm", "two columns of one name"),
-        ("1,2,3", "no column frame"),
-        ('frame,"x_mm', "not CSV"),
-    ],
-)
-def test_headers_that_are_refused(header: str, why: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text(header + "\n")
-    with pytest.raises(DataError, match=why) as caught:
-        growing(path)
-    assert str(path) in str(caught.value)

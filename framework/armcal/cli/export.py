@@ -96,7 +96,7 @@ def export(
                 "it is a directory, expected a file.", where=Location(str(out)), hint="Name the file in it."
             )
         spare_inputs(out, calibration)
-        check_output(out, InputError)
+        check_output(out)
         if not force:
             require_new([out])
     loaded = Calibration.load(calibration, registry, accept)
@@ -133,7 +133,7 @@ def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes
             hint = "Move it, or give --out another name."
             raise InputError("it is a directory, expected a file.", where=Location(str(beside)), hint=hint)
         spare_inputs(beside, calibration)
-        check_output(beside, InputError)
+        check_output(beside)
         files[beside] = content
     return files
 

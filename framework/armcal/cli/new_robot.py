@@ -10,7 +10,7 @@ from armcal.base.units import from_unit, parse_quantity
 from armcal.cli.common import Console, command_line
 from armcal.cli.console import say
 from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError
-from armcal.io.cells import is_number
+from armcal.measure.tables import is_number
 from armcal.plugins import PluginRegistry
 from armcal.scaffold.robot import (
     MOST,

@@ -18,10 +18,10 @@ from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import JointStream
 from armcal.errors import ConfigError, InputError, Location
 from armcal.io.lines import LineCutter
-from armcal.io.udp import UDP_KINDS, listening, parsed
+from armcal.io.udp import LOOPBACK, bound, port_of
 
 STANDARD_INPUT = "-"
-KINDS = f"- (standard input), {UDP_KINDS}, or a file that another program writes"
+KINDS = "- (standard input), udp:PORT of this machine, or a file that another program writes"
 Begin = Literal["start", "end"]
 """From where a file is read: ``end`` passes over what was in it before."""
 
@@ -37,7 +37,7 @@ def _named(value: object) -> object:
     if not isinstance(value, str) or value == STANDARD_INPUT:
         return value
     if value.startswith("udp:"):
-        if parsed(value) is None:
+        if port_of(value) is None:
             raise ValueError(f"found {value!r}, expected {KINDS}")
         return str(value)
     try:
@@ -47,7 +47,7 @@ def _named(value: object) -> object:
 
 
 SourceName = Annotated[str, BeforeValidator(_named)]
-"""``-``, ``udp:PORT``, ``udp:HOST:PORT?from=SENDER``, or the path of a file."""
+"""``-``, ``udp:PORT``, or the path of a file."""
 
 
 class LineSource(Protocol):
@@ -74,8 +74,8 @@ def open_lines(name: str, begin: Begin) -> LineSource:
     """
     if name == STANDARD_INPUT:
         return PipeLines(sys.stdin.fileno(), owned=False)
-    if name.startswith("udp:"):
-        return UdpLines(name)
+    if (port := port_of(name)) is not None:
+        return UdpLines(LOOPBACK, port)
     path = Path(name)
     try:
         kind = path.stat().st_mode
@@ -161,14 +161,11 @@ class PipeLines(LineSource):
 class UdpLines(LineSource):
     """Lines of datagrams on a port of this machine; what comes while nobody looks waits in the system's queue."""
 
-    def __init__(self, name: str) -> None:
-        address = parsed(name)
-        if address is None:
-            raise _refusal(name, "it is no address")
+    def __init__(self, host: str, port: int) -> None:
         try:
-            self._socket, self._is_ours = listening(*address)
+            self._socket = bound(host, port)
         except InputError as fault:
-            raise DeviceRefusedError(fault.message, where=Location(name), hint=fault.hint) from fault
+            raise DeviceRefusedError(fault.message, where=fault.where, hint=fault.hint) from fault
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         self.ended = False
 
@@ -181,11 +178,9 @@ class UdpLines(LineSource):
         lines: list[bytes | None] = []
         for _ in range(1000 * _MOST_AT_ONCE if not self.ended else 0):
             try:
-                data, _, flags, sender = self._socket.recvmsg(LONGEST_LINE_BYTES)
+                data, _, flags, _ = self._socket.recvmsg(LONGEST_LINE_BYTES)
             except OSError:  # nothing is left, or the network is gone for now: both are silence
                 break
-            if not self._is_ours(sender[0]):
-                continue
             lines += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
         return lines
 
@@ -199,7 +194,6 @@ class FileLines(LineSource):
     """Lines of a file that grows. One that was cut or replaced is read from its start, in a call of its own.
 
     Attributes:
-        header: the first line at the time of opening; None if it was not whole.
         renewed: how often the file was cut or replaced.
     """
 
@@ -209,8 +203,6 @@ class FileLines(LineSource):
         self._path = path
         self._cutter, self._position, self.renewed = LineCutter(LONGEST_LINE_BYTES), 0, 0
         self._file = path.open("rb", buffering=0)
-        first, ended, _ = os.pread(self._file.fileno(), LONGEST_LINE_BYTES, 0).partition(b"\n")
-        self.header = first.removesuffix(b"\r") if ended else None
         if begin == "end":
             size = os.fstat(self._file.fileno()).st_size
             start = max(0, size - LONGEST_LINE_BYTES)

@@ -74,43 +74,46 @@ def refuse(path: Path | str, message: str, hint: str, line: int | None = None, c
     raise DataError(message, where=Location(str(path), line=line, field=column), hint=hint)
 
 
-def text_of(content: bytes, path: Path, hint: str) -> str:
-    """Text in UTF-8, without a byte order mark.
+def text_of(content: bytes, path: Path | str, hint: str, line: int = 1, offset: int | None = None) -> str:
+    """Text in UTF-8, without a byte order mark; its first line has the number ``line``.
 
     Raises:
-        DataError: with the line of a byte that is none.
+        DataError: with the line of a byte that is none, and its place in the file where its ``offset`` is known.
     """
+    text, at, fault = "", content.find(b"\0"), "a NUL byte{}, expected text"
     try:
-        text, at, fault = content.decode("utf-8-sig"), content.find(b"\0"), "a NUL byte, expected text"
+        text = content.decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as undecodable:
-        text, at = "", undecodable.start
-        fault = f"the byte 0x{content[at]:02x}, which is not UTF-8 text"
+        if at < 0:
+            at = undecodable.start
+            fault = f"the byte 0x{content[at]:02x}{{}}, which is not UTF-8 text"
     if at >= 0:
-        refuse(path, f"found {fault}.", hint, content.count(b"\n", 0, at) + 1)
+        place = "" if offset is None else f" at offset {offset + at}"
+        refuse(path, f"found {fault.format(place)}.", hint, line + content.count(b"\n", 0, at))
     return text
 
 
 @contextmanager
-def writing(place: Path, hint: str, refusal: type[InputError] = InputError) -> Iterator[None]:
+def writing(place: Path, hint: str) -> Iterator[None]:
     """What is done within writes a file or a folder.
 
     Raises:
-        InputError: of the kind ``refusal``: the operating system refused it.
+        InputError: the operating system refused it.
     """
     try:
         yield
     except OSError as fault:
         message = f"it cannot be written ({fault.strerror or fault})."
-        raise refusal(message, where=Location(str(place)), hint=hint) from fault
+        raise InputError(message, where=Location(str(place)), hint=hint) from fault
 
 
-def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
+def check_output(path: Path) -> None:
     """What stands at an output's path must be nothing, or a regular file that may be replaced.
 
     Replacing a device would take it away, and through a link something else would be written than was named.
 
     Raises:
-        InputError: of the kind ``refusal``: it is a link, a directory, a device or a pipe.
+        InputError: it is a link, a directory, a device or a pipe.
     """
     try:
         mode = path.lstat().st_mode
@@ -119,7 +122,7 @@ def check_output(path: Path, refusal: type[InputError] = DataError) -> None:
     if S_ISREG(mode):
         return
     kind = "a link" if S_ISLNK(mode) else "a directory" if S_ISDIR(mode) else "a device or pipe"
-    raise refusal(
+    raise InputError(
         f"it is {kind}, expected a file or nothing there: {kind} is never replaced nor written through.",
         where=Location(str(path)),
         hint="Give the path of the file itself.",
@@ -191,14 +194,14 @@ def write_over(files: Mapping[Path, bytes]) -> None:
     place = Path()
     try:
         for place in files:
-            check_output(place, InputError)
+            check_output(place)
         for place, content in files.items():
             staged[place] = place.with_name(f"{STAGED}{place.name}")
             write_durably(staged[place], content)
         for place, ready in staged.items():
             os.replace(ready, place)
     except OSError as fault:
-        hint = "Give --out a place that can be written."
+        hint = "Give --out a place that can be written, in a folder that is there."
         raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(place)), hint=hint) from fault
     finally:
         for left in staged.values():

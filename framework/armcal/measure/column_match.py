@@ -10,9 +10,9 @@ from typing import NoReturn
 
 from armcal.base.units import DIMENSIONLESS, UNITS, display_unit, units_of
 from armcal.errors import DataError, Location
-from armcal.io.cells import is_number
 from armcal.measure.checks import refuse_joint_count
 from armcal.measure.reader import ID_NAMES, RequestedChannel
+from armcal.measure.tables import is_number
 
 MAX_COLUMNS = 4000
 

@@ -1,19 +1,16 @@
-"""Writing a dataset as a CSV that reads back to the same SI values."""
+"""Writing a dataset as a CSV that reads back to the same SI values, and any rows as the text of one."""
 
 import csv
+import io
 import math
-import os
-import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TextIO
 
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
-from armcal.io.plain_files import check_output, writing
+from armcal.io.plain_files import write_over
 from armcal.measure.reader import RequestedChannel
 
 ID_COLUMN = "pose_id"
@@ -38,16 +35,13 @@ def write_csv(
         units: of a column by its dimension; by default deg, mm, g, and otherwise the SI unit.
 
     Raises:
-        DataError: a channel of the dataset is not in ``requested_channels``, two columns would have one name, or the
-            file cannot be written.
+        DataError: a channel of the dataset is not in ``requested_channels``, or two columns would have one name.
+        InputError: the file cannot be written.
         ValueError: a unit is not one of its dimension.
     """
     path = Path(path)
     columns = _columns(path, dataset, requested_channels, units)
-    with _replacing(path) as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
+    write_over({path: csv_text([columns, *zip(*columns.values(), strict=True)]).encode()})
 
 
 def _columns(
@@ -103,17 +97,11 @@ def _text(number: float) -> str:
     return "" if math.isnan(number) else repr(number)
 
 
-@contextmanager
-def _replacing(path: Path) -> Iterator[TextIO]:
-    """A stream beside ``path`` that takes its place once all is written; on any fault nothing is left of it."""
-    check_output(path)
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with writing(path, "Check that its folder is there and may be written to.", DataError):
-            with beside.open("x", encoding="utf-8", newline="") as stream:
-                yield stream
-                stream.flush()
-                os.fsync(stream.fileno())
-            beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+def csv_text(rows: Iterable[Iterable[object]], number: str = ".6f") -> str:
+    """Rows as the text of a CSV file, floats in a format; one that is not finite is an empty cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for row in rows:
+        cells = [(format(x, number) if math.isfinite(x) else "") if isinstance(x, float) else x for x in row]
+        writer.writerow(cells)
+    return text.getvalue()

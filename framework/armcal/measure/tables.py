@@ -1,7 +1,8 @@
 """Tables of text: cells by line, with a header or without, and columns as numbers; each fault with line and column.
 
 A file is read once, line by line, and its columns become numbers a few hundred rows at a time, so that neither a long
-file nor a broken one takes much memory. A single bad cell is looked for only when a column fails.
+file nor a broken one takes much memory. A single bad cell is looked for only when a column fails. Where rows come one
+at a time, each is judged as it comes, by the same rules.
 
 A file may have been cut off: an interrupted copy, a full disk. A row that lost cells shows by their number. A last
 number that lost digits is a number still, which only those above it give away. That a file ends without a line end says
@@ -19,24 +20,85 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NoReturn, Self
 
 import numpy as np
 
 from armcal.base.arrays import Array
-from armcal.io.cells import CellFault, plain_numbers, read_cell
-from armcal.io.plain_files import input_file, refuse
+from armcal.base.units import UNITS
+from armcal.io.plain_files import input_file, refuse, text_of
 
 MAX_BYTES = 2 * 1024**3
 MAX_LINE_BYTES = 1024**2
 BLANKS = " "
 """As a delimiter: any number of blanks."""
+SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
+MISSING = frozenset({"", "na", "n/a", "nan", "null", "none"})  # In small letters
+DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 _ROWS_AT_ONCE = 256  # small blocks stay in the processor's cache: faster than thousands
 _LIKELY = "\t;|,"  # The likeliest first: where columns are parted by semicolons, commas are decimal ones
-_SAVE_AS_TEXT = "Save the table as CSV text in UTF-8."
 _PARTS = re.compile(r"\s*[+-]?[0-9]*(?:[.,](?P<decimals>[0-9]*))?(?:[eE][+-]?(?P<exponent>[0-9]+))?\s*")
 _FEWEST_OTHERS = 10
+_UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters", "metres", "m/s^2", "m/s2"} - {"1"})
+_NUMBER_AND_UNIT = re.compile(r"\s*[+-]?[0-9]*[.,]?[0-9]+\s*[^\W\d][\w/^]*\s*")
+
+
+@dataclass(frozen=True)
+class CellFault:
+    """A cell that holds no number: what was found, and how to mend it; sentences."""
+
+    text: str
+    hint: str
+
+
+def is_number(text: str) -> bool:
+    """Whether Python reads a number, in ASCII: it would read 1_000, and digits of other scripts, too."""
+    if not text.isascii() or "_" in text:
+        return False
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def plain_numbers(cells: Sequence[str]) -> Array | None:
+    """Cells as numbers, all at once; None where one is empty or holds none, as ``is_number`` has it."""
+    joined = "".join(cells)
+    if not joined.isascii() or "_" in joined:
+        return None
+    try:
+        return np.array(cells, dtype=np.float64)
+    except ValueError:
+        return None
+
+
+def is_missing(text: str) -> bool:
+    return text.strip().lower() in MISSING
+
+
+def read_cell(cell: str) -> float | CellFault:
+    """The number in a cell; NaN if its value is missing."""
+    if is_number(cell):
+        return float(cell)
+    if is_missing(cell):
+        return float("nan")
+    shown = repr(cell if len(cell) <= 40 else f"{cell[:40]}...")
+    if DECIMAL_COMMA.fullmatch(cell):
+        return CellFault(f"found {shown}, a decimal comma.", f"Write decimal points: {with_point(cell)}.")
+    if cell.strip(" []()").lower() in _UNIT_WORDS:
+        mend = "Remove it; each column's name ends in its unit, as in q1_deg."
+        return CellFault(f"found {shown}: this looks like a row of units.", mend)
+    hint = "Correct it, or leave the cell empty to set the record aside."
+    if _NUMBER_AND_UNIT.fullmatch(cell):
+        hint = "Write the number alone; its unit belongs in the column's name."
+    return CellFault(f"found {shown}, expected a number.", hint)
+
+
+def with_point(text: str) -> str:
+    return text.strip().replace(",", ".")
+
 
 Row = tuple[int, list[str]]
 """The line on which a row begins, and its cells."""
@@ -103,7 +165,7 @@ class Table:
         while block := list(islice(rows, _ROWS_AT_ONCE)):
             for line, cells in block:
                 if len(cells) != width:
-                    self._refuse_ragged(line, cells, width, "header" if has_header else "first row")
+                    _refuse_ragged(self.path, line, cells, width, has_header)
             own = [line for line, _ in block]
             table = list(zip(*(cells for _, cells in block), strict=True))
             for (place, name), parts in zip(numbers, blocks, strict=True):
@@ -117,13 +179,67 @@ class Table:
         columns = tuple(np.concatenate(parts) if parts else np.zeros(0) for parts in blocks)
         return Columns(tuple(lines), columns, tuple(map(tuple, words)))
 
-    def _refuse_ragged(self, line: int, cells: Sequence[str], width: int, like: str) -> None:
-        mend = "Complete the row (was the file cut off?); leave a cell empty if its value is not known."
-        if cells[0].lstrip().startswith("#"):
-            mend = "Remove the line: comments are not read."
-        elif len(cells) > width:
-            mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
-        refuse(self.path, f"found {len(cells)} cells, expected {width} as in the {like}.", mend, line)
+
+@dataclass(frozen=True)
+class LineTable:
+    """A table whose rows come one at a time, each judged as it comes; a quoted cell ends on the line of its begin.
+
+    Attributes:
+        source: what it is called in messages.
+        header: the cells of its first row.
+    """
+
+    source: str
+    delimiter: str
+    header: tuple[str, ...]
+
+    @classmethod
+    def begun(cls, text: str, source: str, line: int) -> Self:
+        """By its header, in which the delimiter is the likeliest one.
+
+        Raises:
+            DataError: it is not CSV.
+        """
+        delimiter = delimiter_of(text)
+        return cls(source, delimiter, tuple(_split(text, source, line, delimiter)))
+
+    def row(self, text: str, line: int) -> list[str] | None:
+        """The cells of a further line that is not blank; None for the header once more.
+
+        Raises:
+            DataError: it is not CSV, or has another number of cells than the header.
+        """
+        cells = _split(text, self.source, line, self.delimiter)
+        if tuple(cells) == self.header:
+            return None
+        if len(cells) != len(self.header):
+            _refuse_ragged(self.source, line, cells, len(self.header), True)
+        return cells
+
+
+def _refuse_ragged(source: Path | str, line: int, cells: Sequence[str], width: int, has_header: bool) -> None:
+    mend = "Complete the row (was the file cut off?); leave a cell empty if its value is not known."
+    if cells[0].lstrip().startswith("#"):
+        mend = "Remove the line: comments are not read."
+    elif len(cells) > width:
+        mend = "Quote text that holds the delimiter, write numbers with a decimal point (12.5), no comma."
+    like = "header" if has_header else "first row"
+    refuse(source, f"found {len(cells)} cells, expected {width} as in the {like}.", mend, line)
+
+
+def _refuse_not_csv(source: Path | str, fault: csv.Error, line: int) -> NoReturn:
+    hint = "Close every quote, end lines with LF or CRLF, and put no bare quote inside a quoted cell."
+    refuse(source, f"found a row that is not CSV ({fault}).", hint, line)
+
+
+def _split(text: str, source: Path | str, line: int, delimiter: str) -> list[str]:
+    """The cells of one line."""
+    if delimiter == BLANKS:
+        return [cell.strip('"') for cell in text.split()]
+    try:
+        return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter, strict=True), [])]
+    except csv.Error as fault:
+        _refuse_not_csv(source, fault, line)
 
 
 @contextmanager
@@ -181,28 +297,9 @@ def _text_lines(file: BinaryIO, path: Path, digest: "hashlib._Hash") -> Iterator
     for number, raw in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), start=1):
         digest.update(raw)
         if len(raw) > MAX_LINE_BYTES:
-            refuse(path, "found a line of more than 1 MiB, expected a record.", _SAVE_AS_TEXT, number)
-        text = line_text(raw, path, number, offset)
-        yield text.removeprefix("\ufeff") if number == 1 else text
+            refuse(path, "found a line of more than 1 MiB, expected a record.", SAVE_AS_TEXT, number)
+        yield text_of(raw, path, SAVE_AS_TEXT, number, offset)
         offset += len(raw)
-
-
-def line_text(raw: bytes, path: Path, number: int | None = None, offset: int | None = None) -> str:
-    """The text of a line, by its number and its offset in the file where it has one.
-
-    Raises:
-        DataError: it is none.
-    """
-    text, at, what = "", raw.find(b"\0"), "a NUL byte{}, expected text"
-    if at < 0:
-        try:
-            text = raw.decode("utf-8")
-        except UnicodeDecodeError as fault:
-            at, what = fault.start, f"the byte 0x{raw[fault.start]:02x}{{}}, which is not UTF-8 text"
-    if at >= 0:
-        there = "" if offset is None else f" at offset {offset + at}"
-        refuse(path, f"found {what.format(there)}.", _SAVE_AS_TEXT, number)
-    return text
 
 
 def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
@@ -217,8 +314,8 @@ def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
         else:
             return
     if delimiter == BLANKS:
-        split = ((number, text.split()) for number, text in enumerate(lines, begun))
-        yield from ((number, [cell.strip('"') for cell in cells]) for number, cells in split if cells)
+        split = ((number, _split(text, path, number, BLANKS)) for number, text in enumerate(lines, begun))
+        yield from ((number, cells) for number, cells in split if cells)
         return
     reader, line = csv.reader(lines, delimiter=delimiter, strict=True), begun
     try:
@@ -227,8 +324,7 @@ def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
                 yield line, cells
             line = begun + reader.line_num
     except csv.Error as fault:
-        hint = "Close every quote, end lines with LF or CRLF, and put no bare quote inside a quoted cell."
-        refuse(path, f"found a row that is not CSV ({fault}).", hint, line)
+        _refuse_not_csv(path, fault, line)
 
 
 def delimiter_of(text: str) -> str:
@@ -236,7 +332,7 @@ def delimiter_of(text: str) -> str:
     return next((delimiter for delimiter in _LIKELY if delimiter in text), BLANKS)
 
 
-def number_of(path: Path, line: int | None, cell: str, name: str) -> float:
+def number_of(path: Path | str, line: int | None, cell: str, name: str) -> float:
     """A cell's number; NaN where it is empty.
 
     Raises:

@@ -674,7 +674,7 @@ def require_numbers(problem: Problem, dataset: Dataset) -> None:
             numbers = zip(kernel.factor.channels, own.record[:, lost[0]], strict=True)
             if empty := [channel for channel, number in numbers if not np.isfinite(number)]:
                 text = f"found no number for {', '.join(empty)} in the record {record}."
-                hint = "A reader refuses or sets aside such records: armcal.measure.checks.check_dataset does."
+                hint = "A reader refuses or sets aside such records: armcal.measure.checks.read_as does."
                 raise DataError(text, where=dataset.where(int(lost[0])), hint=hint)
             _check_displacements(problem, dataset)
             raise ProblemError(

@@ -24,7 +24,7 @@ from armcal.diagnose.verdict import evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.validation import in_unit
 from armcal.io import folder as folders
-from armcal.io.cells import csv_text
+from armcal.measure.csv_writer import csv_text
 from armcal.measure.reader import surroundings
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment

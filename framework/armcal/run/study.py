@@ -38,8 +38,8 @@ from armcal.estimate.validation import (
     in_unit,
     summarise,
 )
-from armcal.io.cells import csv_text
 from armcal.io.parallel import Executor
+from armcal.measure.csv_writer import csv_text
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, ExperimentSettings, ValidationSettings

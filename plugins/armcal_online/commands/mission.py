@@ -31,8 +31,6 @@ OURS = (BENCH, RECORDS, CALIBRATION, RECALIBRATION, *FIGURES)  # an earlier miss
 _INK = "#333333"
 _CURVES = {  # colour, width and name, those above last
     "frozen": ("#b5542a", 1.2, "frozen at launch"),
-    "refit": ("#7a9a3a", 1.0, "robust refit of all"),
-    "refit_recent": ("#8b6fb3", 1.0, "robust refit of the last {records}"),
     "recalibrated": ("#1f5fa8", 1.5, "recalibrated"),
 }
 _LEVELS = {"nominal": "#4c9f70", "watch": "#e3c14b", "suspect": "#dd7f33", "lost": "#b8322f"}
@@ -53,17 +51,14 @@ def mission(console: Console, config: Path, out: Path, overrides: tuple[str, ...
     kept.place({})
     with console.progress() as progress:
         made, curve, content = run_mission(plan, out, progress)
-    records = plan.settings.refit.records
-    picture = mission_figure(curve, content, records)
-    texts = (curve_text(curve, made).encode(), f"{as_json(content)}\n".encode(), picture)
+    texts = (curve_text(curve, made).encode(), f"{as_json(content)}\n".encode(), mission_figure(curve, content))
     with writing(out, "Check the room on the disk."):
         for name, data in zip(FIGURES, texts, strict=True):
             (out / name).write_bytes(data)
     console.result({**content, "folder": str(out)})
     rows, share = list[tuple[str, ...]](), content["within_limit"]
     for name, sizes in content["error_mm"].items():
-        label = _CURVES[name][2].format(records=records)
-        rows.append((label, *(f"{size:.3f}" for size in sizes.values()), f"{share[name]:.1%}"))
+        rows.append((_CURVES[name][2], *(f"{size:.3f}" for size in sizes.values()), f"{share[name]:.1%}"))
     columns = ("calibration", "mean", "median", "95 %", "max", "last", f"within {content['limit_mm']:g} mm")
     console.table(f"Mean tip error over {content['days']:g} days, mm", columns, rows)
     for line in _lines(content):
@@ -85,8 +80,8 @@ def _lines(content: Mapping[str, Any]) -> Iterator[str]:
     )
 
 
-def mission_figure(curve: ErrorCurve, content: Mapping[str, Any], records: int) -> bytes:
-    """A PNG; the refit of recent records is one of so many."""
+def mission_figure(curve: ErrorCurve, content: Mapping[str, Any]) -> bytes:
+    """A PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
@@ -98,9 +93,7 @@ def mission_figure(curve: ErrorCurve, content: Mapping[str, Any], records: int) 
     for day in range(-1, int(np.ceil(days))):
         axes.axvspan(*(day + hour / 24 for hour in _NIGHT), color="#eef0f4", lw=0, zorder=0)
     for height, (name, (color, width, label)) in enumerate(_CURVES.items(), 3):
-        if name in curve.errors:
-            mm = 1000 * curve.errors[name]
-            axes.plot(at, mm, color=color, lw=width, label=label.format(records=records), zorder=height)
+        axes.plot(at, 1000 * curve.errors[name], color=color, lw=width, label=label, zorder=height)
     axes.axhline(limit, color=_INK, lw=0.9, ls=(0, (5, 4)), zorder=2, label=f"limit {limit:g} mm")
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 3)))

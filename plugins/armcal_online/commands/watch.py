@@ -1,17 +1,14 @@
 """``armcal watch``: the status and the newest events of a recalibration, served with one page that shows them.
 
-On this machine every request is answered that uses one of its own names; from elsewhere it needs the token.
+It is served to this machine alone, to requests that use one of its own names.
 """
 
 import base64
 import hashlib
-import hmac
-import ipaddress
 import json
 import math
 import re
 import signal
-import socket
 import sys
 from collections.abc import Mapping
 from functools import lru_cache
@@ -19,9 +16,8 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
-from secrets import token_urlsafe
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 import click
 from armcal.base.config_text import as_line
@@ -32,6 +28,7 @@ from armcal.version import JSON_SCHEMA
 from armcal_online.running.situation import EARLIER, EVENTS, present, when
 
 DEFAULT_PORT = 8642
+_HOST = "127.0.0.1"
 _TAIL_BYTES = 1 << 20  # of the events; all are in the files
 _MOST_LISTED, _MOST_RECORDS = 100, 300
 _PATIENCE_S = 10.0  # how long a client may take to send its request, or to take an answer
@@ -41,11 +38,10 @@ _LISTED = ("event", "sequence", "at", "kind", "to", "sentence", "do", "confirm",
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--host", default="127.0.0.1", show_default=True, help="Listen there; beyond this machine with a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=DEFAULT_PORT, show_default=True, help="0: any free one.")
 @click.option("--once", is_flag=True, help="Print the present state and end.")
 @click.option("--json", "as_json", is_flag=True, help="With --once: as JSON.")
-def watch(folder: Path, host: str, port: int, once: bool, as_json: bool) -> None:
+def watch(folder: Path, port: int, once: bool, as_json: bool) -> None:
     """Show a recalibration live, as a page in the browser. DIR is its folder, which is only read."""
     where, hint = Location(str(folder)), "Give what armcal recalibrate was given as --out."
     if not folder.is_dir():
@@ -61,7 +57,7 @@ def watch(folder: Path, host: str, port: int, once: bool, as_json: bool) -> None
         for line in first_screen(now):
             say(line)
     else:
-        _serve(WatchServer(folder, host, port))
+        _serve(WatchServer(folder, port))
 
 
 def _serve(server: "WatchServer") -> None:
@@ -140,13 +136,6 @@ def newest_events(folder: Path) -> dict[str, list[dict[str, Any]]]:
     return {"records": records[-_MOST_RECORDS:], "listed": listed[-_MOST_LISTED:]}
 
 
-def is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 @lru_cache
 def page() -> tuple[bytes, str]:
     """The page, and the policy that lets no script and style in but its own."""
@@ -158,46 +147,37 @@ def page() -> tuple[bytes, str]:
 
 
 class WatchServer(ThreadingHTTPServer):
-    """Serves a folder's state at an address.
-
-    Attributes:
-        token: demanded of every request; None on an address of this machine alone.
+    """Serves a folder's state to this machine; from elsewhere SSH leads there.
 
     Raises:
-        InputError: the address cannot be listened on.
+        InputError: the port cannot be listened on.
     """
 
     daemon_threads, block_on_close = True, False
 
-    def __init__(self, folder: Path, host: str = "127.0.0.1", port: int = 0) -> None:
-        self.folder, self.host = folder, host
-        self.token = None if is_loopback(host) else token_urlsafe(24)
-        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    def __init__(self, folder: Path, port: int = 0) -> None:
+        self.folder = folder
         try:
-            super().__init__((host, port), _Handler)
+            super().__init__((_HOST, port), _Handler)
         except (OSError, OverflowError) as fault:
             raise InputError(
-                f"{host}, port {port}, cannot be listened on ({fault}).",
+                f"port {port} cannot be listened on ({fault}).",
                 where=Location("--port"),
                 hint="Give another --port; 0 takes any free one.",
             ) from fault
 
     @property
     def address(self) -> str:
-        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
-        host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.server_address[1]}/{f'?token={self.token}' if self.token else ''}"
+        return f"http://{_HOST}:{self.server_address[1]}/"
 
-    def allows(self, host_header: str | None, token: str | None) -> bool:
-        """Judge a request by its Host header and its token.
+    def allows(self, host_header: str | None) -> bool:
+        """Judge a request by its Host header, which must name this machine.
 
-        Without a token the header must name this machine: a page of another site, whose name was made to point here,
-        is refused. The port may be any, since a tunnel may begin at another one.
+        A page of another site, whose name was made to point here, is refused. The port may be any, since a tunnel may
+        begin at another one.
         """
-        if self.token is not None:
-            return hmac.compare_digest((token or "").encode(), self.token.encode())
         named = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[]+))(?::[0-9]*)?", (host_header or "").strip().lower())
-        return named is not None and (named[1] or named[2]) in ("localhost", "127.0.0.1", "::1", self.host)
+        return named is not None and (named[1] or named[2]) in ("localhost", _HOST, "::1")
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that went away is no fault."""
@@ -210,9 +190,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """The page, or the state."""
         address = urlsplit(self.path)
-        token = parse_qs(address.query).get("token", [None])[-1]
-        if not self.server.allows(self.headers.get("Host"), token):
-            self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name or token in the address.\n")
+        if not self.server.allows(self.headers.get("Host")):
+            self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name in the address.\n")
         elif address.path == "/":
             self._answer(HTTPStatus.OK, page()[0], "text/html")
         elif address.path == "/state":
@@ -226,7 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.NOT_FOUND, b"Not found.\n")
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing: a token would be in it."""
+        """Nothing: the terminal has the address alone."""
 
     def _answer(self, status: HTTPStatus, body: bytes, kind: str = "text/plain") -> None:
         self.send_response(status)

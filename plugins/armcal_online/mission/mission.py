@@ -1,12 +1,12 @@
 """A simulated mission: calibrated before launch, recalibrated record by record, compared with its truth."""
 
-import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -19,13 +19,11 @@ from armcal.calibration.calibration_file import sealed
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, NotConvergedError
-from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
-from armcal.estimate.polish import descended, polish
-from armcal.estimate.robust import reweighted
+from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.lines import StandardOutput
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.csv_writer import csv_text, write_csv
 from armcal.plugins import PluginRegistry, discover
-from armcal.problem.problem import PosedProblem, Problem
+from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
@@ -45,17 +43,9 @@ SECTION = "mission"
 BENCH, CALIBRATION, RECORDS, RECALIBRATION = "bench.csv", "calibration.yaml", "records.csv", "recalibration"
 _MM = 1000.0
 Series = Sequence[tuple[float, Array]]  # value vectors in order, with the time from which on each is used (s)
-_GROWTH, _FIRST_STEPS, _DAMPING, _ENOUGH = 1.1, 5, 1e-3, 1e-3
-_DOUBTFUL = 2.0  # residuals so many times the noise: the fit may have come to rest at the wrong minimum
+_NONE: Mapping[str, Series] = MappingProxyType({})
 _USABLE = ("nominal", "watch")
 _RECOVERED, _IN_A_ROW = 1.5, 3  # the error is within so many times that of the day before, so often in a row
-
-
-class RefitSettings(Settings):
-    """Robust fits that the recalibration is compared with: of the last ``records``, anew after ``every`` so many."""
-
-    records: Annotated[int, Field(ge=10, le=1000)] = 40
-    every: Annotated[int, Field(ge=1)] = 10
 
 
 class MissionRunSettings(Settings):
@@ -65,7 +55,6 @@ class MissionRunSettings(Settings):
     calibration: InputPath | None = None  # or a file that is there already
     limit: Annotated[Length, Field(gt=0)] = 0.003  # of the mean tip error, for the arm to be used
     poses: Annotated[int, Field(ge=1, le=5000)] = 200  # in which tips are compared
-    refit: RefitSettings = Field(default_factory=RefitSettings)
 
     @model_validator(mode="after")
     def _one_start(self) -> Self:
@@ -190,67 +179,6 @@ def recalibrated(plan: MissionPlan, mission: Mission, calibration: Path, folder:
     return log
 
 
-class GaussNewton:
-    """An estimator for fits that start near their solution: some damped steps, then undamped ones to the last digit."""
-
-    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
-        posed = PosedProblem(problem)
-        near = descended(posed, posed.x(start), _FIRST_STEPS, _DAMPING, _ENOUGH)
-        values = posed.values(polish(posed, near))
-        return Solution(values, SolverVerdict("Gauss-Newton", "at rest", True, _FIRST_STEPS, 0.0))
-
-
-def refits(plan: MissionPlan, parameters: Parameters, mission: Mission) -> dict[str, Series]:
-    """Robust fits (Cauchy) of all records so far, and of the most recent ones; none with too few records.
-
-    Nominal ``parameters`` are those of the calibration before launch. Each fit starts from the one before. That of the
-    recent ones is made anew every ``settings.every`` records, that of all whenever these are a tenth more.
-    """
-    system, settings, count = plan.experiment.system, plan.settings.refit, len(mission.records)
-    first = settings.records
-    if count < first:
-        return {}
-    parts = (system.arms, system.measurements, parameters, system.environment, mission.records)
-    problem = Problem.build(*parts, plan.experiment.settings.evaluator)
-    launch = parameters.nominal()
-    everything = [first]
-    while (following := max(int(_GROWTH * everything[-1]), everything[-1] + settings.every)) <= count:
-        everything.append(following)
-    spans = {
-        "refit": [(0, last) for last in everything],
-        "refit_recent": [(last - first, last) for last in range(first, count + 1, settings.every)],
-    }
-    earliest = robust_fit(problem.subset(np.arange(first)), [launch])
-    made: dict[str, Series] = {}
-    for name, (_, *later) in spans.items():
-        series = [(0.0, launch), (float(mission.times[first - 1]), earliest)]
-        for begin, end in later:
-            starts = series[-1][1], launch
-            values = robust_fit(problem.subset(np.arange(begin, end)), starts)
-            series.append((float(mission.times[end - 1]), values))
-        made[name] = series
-    return made
-
-
-def robust_fit(problem: Problem, starts: Sequence[Array]) -> Array:
-    """The values of a Cauchy fit; from the next start if the one before leads to residuals beyond the noise.
-
-    The smallest median residual wins. The first start itself, if none leads anywhere.
-    """
-    best, values = np.inf, starts[0]
-    for start in starts:
-        try:
-            first = Solution(start, SolverVerdict("start", "", True, 0, 0.0))
-            fit = reweighted(problem, GaussNewton(), first, "cauchy")
-        except NotConvergedError:
-            continue
-        if max(fit.scales) < best:
-            best, values = max(fit.scales), fit.solution.values
-        if best < _DOUBTFUL:
-            break
-    return values
-
-
 @dataclass(frozen=True)
 class ErrorCurve:
     """Mean tip errors (m) by calibration, at every record and every hour (T, s since the mission began)."""
@@ -263,11 +191,11 @@ class ErrorCurve:
 
 
 def error_curve(
-    plan: MissionPlan, launch: Parameters, mission: Mission, log: MissionLog, references: Mapping[str, Series]
+    plan: MissionPlan, launch: Parameters, mission: Mission, log: MissionLog, references: Mapping[str, Series] = _NONE
 ) -> ErrorCurve:
     """Mean distance between a calibration's tip and the true one, as the camera sees it, in fixed random poses.
 
-    Nominal values of ``launch`` are those of the calibration before launch.
+    Nominal values of ``launch`` are those of the calibration before launch. A study adds ``references`` by name.
     """
     truth, system = mission.truth, plan.experiment.system
     if truth.parameters.entry_names != launch.entry_names:
@@ -397,9 +325,7 @@ def curve_text(curve: ErrorCurve, mission: Mission) -> str:
         "temperature_C": truth.temperature_at(curve.times).round(3).tolist(),
         **{truth.parameters.entry_names[i]: values[:, i].tolist() for i in np.flatnonzero(np.ptp(values, axis=0))},
     }
-    stream = io.StringIO()
-    csv.writer(stream, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
-    return stream.getvalue()
+    return csv_text([columns, *zip(*columns.values(), strict=True)], "")
 
 
 def run_mission(
@@ -411,6 +337,5 @@ def run_mission(
     path = before_launch(plan, folder, progress)
     launch = with_payload(Calibration.load(path, experiment.registry).parameters)
     log = recalibrated(plan, mission, path, folder)
-    references = refits(plan, with_payload(experiment.parameters).with_nominal(launch.nominal()), mission)
-    curve = error_curve(plan, launch, mission, log, references)
+    curve = error_curve(plan, launch, mission, log)
     return mission, curve, figures(plan, mission, log, curve)

@@ -12,7 +12,8 @@ from zlib import crc32
 
 from armcal.errors import DataError, InputError, Location
 from armcal.io.lines import MAX_LINE_BYTES
-from armcal.io.plain_files import input_file
+from armcal.io.plain_files import input_file, text_of
+from armcal.measure.tables import SAVE_AS_TEXT
 from typing_extensions import override
 
 from armcal_online.sources.row_parser import KINDS, Kind, LineParser, LineReading, RowParser
@@ -53,7 +54,7 @@ class CsvFile(Source):
         lines = enumerate(head.split(b"\n")[: None if at_end == "stop" else -1], start=1)
         number, line = next(((number, line) for number, line in lines if line.strip()), (0, b""))
         if line and self._kind == "csv":
-            rows.table(line.decode("utf-8", "replace").removeprefix("\ufeff").strip("\r"), str(path), number)
+            rows.table(text_of(line, path, SAVE_AS_TEXT, number).strip("\r"), str(path), number)
 
     @override
     def resume(self, positions: Mapping[str, int]) -> None:

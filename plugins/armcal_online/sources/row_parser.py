@@ -3,7 +3,6 @@
 A source must survive any input: what cannot be read becomes a record with a fault, never an exception.
 """
 
-import csv
 import json
 import math
 from collections import deque
@@ -13,10 +12,11 @@ from typing import Any, Literal
 
 from armcal.base.units import from_unit
 from armcal.errors import DataError
-from armcal.io.cells import DELIMITERS, CellFault, is_missing, read_cell, split
 from armcal.io.lines import LineCutter
+from armcal.io.plain_files import refuse, text_of
 from armcal.measure.column_match import Header, Plan, header_of, match_columns, refuse_missing, renamed
 from armcal.measure.reader import ReadRequest, RequestedChannel
+from armcal.measure.tables import SAVE_AS_TEXT, LineTable, is_missing, number_of
 
 from armcal_online.sources.source import Incoming, Place
 
@@ -35,10 +35,9 @@ _PLANS = 64  # so many sets of names are remembered, each with its plan or why t
 
 @dataclass(frozen=True)
 class Table:
-    """A header that was understood: its cells as written, its delimiter, and which column is what."""
+    """A header that was understood, and which column is what."""
 
-    cells: tuple[str, ...]
-    delimiter: str
+    lines: LineTable
     plan: Plan
 
 
@@ -57,25 +56,18 @@ class RowParser:
         Raises:
             DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
         """
-        delimiter = next((d for d in DELIMITERS if d in line), DELIMITERS[0])
-        try:
-            cells = split(line, delimiter)
-        except csv.Error as fault:
-            raise DataError(f"the header is not CSV ({fault}).", hint="Close every quote.") from fault
-        header = renamed(header_of(cells, source, number), self._columns)
-        return Table(tuple(cells), delimiter, self._matched(header))
+        lines = LineTable.begun(line, source, number)
+        header = renamed(header_of(lines.header, source, number), self._columns)
+        return Table(lines, self._matched(header))
 
     def row(self, table: Table, line: str, place: Place) -> Incoming | None:
-        """The record in a line of a table; None for the header, written again."""
-        try:
-            cells = split(line, table.delimiter)
-        except csv.Error as fault:
-            return faulty(place, f"The row is not CSV ({fault}).")
-        if tuple(cells) == table.cells:
-            return None
-        if len(cells) != len(table.cells):
-            return faulty(place, f"Found {len(cells)} cells, expected {len(table.cells)} as in the header.")
-        return self._record(table.plan, cells, place)
+        """The record in a line of a table; None for the header, written again.
+
+        Raises:
+            DataError: it is no row of the table.
+        """
+        cells = table.lines.row(line, place.row)
+        return None if cells is None else self._record(table.plan, cells, place)
 
     def json_text(self, text: str, place: Place) -> Incoming:
         try:
@@ -142,11 +134,12 @@ class RowParser:
             return faulty(place, "Its id is empty.")
         channels: dict[str, float] = {}
         for channel, (column, unit) in plan.channels.items():
-            number = _number(cells[column.index])
-            if _APPROACH in channel and isinstance(number, float) and not (math.isnan(number) or number in (-1, 0, 1)):
-                number = CellFault(f"found the approach {number:g}, expected -1, 0 or 1.", "")
-            if isinstance(number, CellFault):
-                sentence = f"{_short(column.name, MAX_ID)}: {number.text} {number.hint}".rstrip()
+            try:
+                number = _number(cells[column.index], column.name)
+                if _APPROACH in channel and not (math.isnan(number) or number in (-1, 0, 1)):
+                    refuse("", f"found the approach {number:g}, expected -1, 0 or 1.", "", column=column.name)
+            except DataError as fault:
+                sentence = f"{_short(column.name, MAX_ID)}: {fault.message} {fault.hint}".rstrip()
                 return replace(faulty(place, sentence), record_id=record_id)
             channels[channel] = from_unit(number, unit)
         return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)
@@ -177,18 +170,16 @@ class LineParser:
             return None
         if line is None:
             return faulty(place, "The line has more than 1 MiB, expected a record.")
-        if b"\0" in line:
-            return faulty(place, "The line holds a NUL byte, expected text.")
         try:
-            text = line.decode("utf-8").removeprefix("\ufeff")
-        except UnicodeDecodeError as fault:
-            return faulty(place, f"The line holds the byte 0x{line[fault.start]:02x}, which is not UTF-8 text.")
-        if not text.strip():
-            return None
-        if self._kind == "json" or (self._kind == "either" and text.lstrip().startswith("{")):
-            return self._rows.json_text(text, place)
-        if self._table is not None:
-            return self._rows.row(self._table, text, place)
+            text = text_of(line, self._source, SAVE_AS_TEXT, place.row)
+            if not text.strip():
+                return None
+            if self._kind == "json" or (self._kind == "either" and text.lstrip().startswith("{")):
+                return self._rows.json_text(text, place)
+            if self._table is not None:
+                return self._rows.row(self._table, text, place)
+        except DataError as fault:
+            return faulty(place, f"{fault.message[:1].upper()}{fault.message[1:]} {fault.hint}")
         try:
             self._table = self._rows.table(text, self._source, place.row)
         except DataError as fault:
@@ -205,18 +196,22 @@ def faulty(place: Place, sentence: str) -> Incoming:
     )
 
 
-def _number(value: Any) -> float | CellFault:
-    """A cell, or a value of a JSON object; NaN where it is missing."""
+def _number(value: Any, name: str) -> float:
+    """A cell, or a value of a JSON object, in the column of a name; NaN where it is missing.
+
+    Raises:
+        DataError: it is no number.
+    """
     if value is None:
         return math.nan
     if isinstance(value, str):
-        return read_cell(value)
+        return number_of("", None, value, name)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return CellFault(f"found {_short(json.dumps(value), 40)}, expected a number.", "")
+        refuse("", f"found {_short(json.dumps(value), 40)}, expected a number.", "", column=name)
     try:
         return float(value)
     except OverflowError:
-        return CellFault("found a number that is too large.", "")
+        refuse("", "found a number that is too large.", "", column=name)
 
 
 def _text(value: Any) -> str:

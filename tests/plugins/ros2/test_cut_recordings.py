@@ -96,13 +96,14 @@ def test_rows_that_only_a_journal_holds_are_named(tour: bags.Tour, tmp_path: Pat
     assert any("holds messages that are not read" in remark for remark in Bag(killed).remarks)
 
 
-def test_a_metadata_file_that_cannot_be_used_is_named(tour: bags.Tour) -> None:
+def test_a_metadata_file_that_cannot_be_used_is_refused_with_what_makes_another(tour: bags.Tour) -> None:
     bag, file = recorded(tour, "listed", "mcap", "")
     metadata = bag / "metadata.yaml"
     text = metadata.read_text()
     for damaged in (text.replace(f"- {file.name}", f"- {file.name}\n  - other_1.mcap", 1), "rosbag2: ["):
         metadata.write_text(damaged)
-        assert any("metadata.yaml cannot be used" in warning for warning in read(tour, bag).warnings)
+        with pytest.raises(DataError, match=r"reindex FOLDER the metadata\.yaml"):
+            read(tour, bag)
     file.unlink()
     metadata.unlink()
     with pytest.raises(DataError, match=r"no metadata.yaml and no file \.mcap or \.db3"):

@@ -33,8 +33,9 @@ def calibrated(config: Path) -> tuple[Calibration, Array, Array]:
 
 @pytest.mark.slow
 def test_a_recording_gives_the_calibration_of_the_table(tour: bags.Tour) -> None:
+    """Though the tracker's clock is 37 ms ahead: what is averaged lies well within a rest."""
     bag = bags.write_bag(tour.config.with_name("bag"), tour.sent(ahead=0.037), compressed="storage")
-    from_bag, values, _ = calibrated(bags.of_bag(tour, bag, clock_offset="estimate"))
+    from_bag, values, _ = calibrated(bags.of_bag(tour, bag))
     from_table, table_values, table_deviations = calibrated(tour.config)
     assert (np.abs(values - table_values) < 4 * table_deviations).all()
     random = np.random.default_rng(9)
@@ -61,5 +62,5 @@ def test_a_frame_that_is_computed_from_joints_is_named(tmp_path: Path) -> None:
     for name, noise, expected in (("computed", 0.0, True), ("measured", 3e-4, False)):
         seen = bags.simulated(experiment, exact) + np.random.default_rng(2).normal(0.0, noise, (len(at), 3))
         bag = bags.write_bag(tour.config.with_name(name), replace(tour, seen=(at, seen)).sent())
-        warnings = Experiment.load(bags.of_bag(tour, bag)).read().warnings
-        assert any("follows the nominal arm" in text for text in warnings) == expected
+        done = CliRunner().invoke(run, [str(bags.of_bag(tour, bag)), "--out", str(tmp_path / f"run_{name}")])
+        assert ("follow the nominal arm" in done.output) == expected, done.output
