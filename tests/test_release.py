@@ -161,7 +161,7 @@ def test_every_tool_that_is_pinned_is_declared_or_needed() -> None:
     names = {text.replace("[", ">").replace(";", ">").split(">")[0].split("=")[0].strip().lower() for text in declared}
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
-    indirect = {"clarabel"}
+    indirect = {"clarabel", "dask", "distributed"}
     assert pinned <= names | indirect
     assert {"figaroh", "roboticstoolbox-python", "smbus2"} >= names - pinned
 
@@ -255,7 +255,7 @@ WITH = {
     "ros2": "import rosbags.rosbag2, rosbags.typesys",
     "docs": "import mkdocs, material, pymdownx, latex2mathml",
     "dev": "import ruff, mypy.api, yaml",
-    "test": "import pytest, hatchling, xdist, hypothesis, pinocchio",
+    "test": "import pytest, hatchling, xdist, hypothesis, pinocchio, distributed",
     "bench": "import figaroh, pinocchio",
 }
 """What works with an extra and not without it."""

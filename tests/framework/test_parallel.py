@@ -1,4 +1,4 @@
-"""Independent work on processes and threads: the same numbers, the same faults, no leftovers."""
+"""Independent work on processes, threads and a dask cluster: the same numbers, the same faults, no leftovers."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from armcal.cli.main import cli, main
 from armcal.errors import ArmcalError, ConfigError, InputError, Location
 from armcal.estimate.estimator import spread
 from armcal.estimate.validation import FitTask, cross_validate, fit_and_judge, folds
+from armcal.io import parallel
 from armcal.io.parallel import Automatic, Executor, Sequential, Workers, parse_executor
 from armcal.problem.problem import Problem
 from click.testing import CliRunner
@@ -49,6 +50,7 @@ def _fold_errors(lrm, executor: Executor | None) -> np.ndarray:
         ("3", Workers("loky", 3)),
         (" 2 ", Workers("loky", 2)),
         ("threading:2", Workers("threading", 2)),
+        ("dask:tcp://10.0.0.1:8786", Workers("dask", address="tcp://10.0.0.1:8786")),
     ],
 )
 def test_what_the_option_says(text: str, expected: Executor) -> None:
@@ -56,12 +58,12 @@ def test_what_the_option_says(text: str, expected: Executor) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "0", "-1", "2.5", "two", "loky", "threading:", "threading:0", "dask:tcp://10.0.0.1:8786", "3:4"]
+    "text", ["", "0", "-1", "2.5", "two", "loky", "threading:", "threading:0", "dask", "dask:", "3:4"]
 )
 def test_what_the_option_cannot_say_is_bad_input(text: str) -> None:
     done = CliRunner().invoke(cli, ["run", DEMO, "--parallel", text])
     assert done.exit_code == 2
-    assert "--parallel" in done.output and "threading:N" in done.output
+    assert "--parallel" in done.output and "dask:ADDRESS" in done.output
 
 
 @pytest.mark.quick("interpreted")
@@ -207,19 +209,55 @@ def _blas(task: None) -> str | None:
     return os.environ.get("OPENBLAS_NUM_THREADS")
 
 
+@pytest.fixture(scope="module")
+def cluster():
+    """The address of a dask cluster of two processes on this machine."""
+    distributed = pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
+    local = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
+    )
+    with local as running:
+        running.wait_for_workers(2)
+        yield running.scheduler_address
+
+
 @pytest.mark.slow
-def test_a_study_in_two_processes_finds_the_same_figures(tmp_path: Path) -> None:
+def test_a_dask_cluster_of_two_processes_gives_the_same_bits(lrm, cluster: str) -> None:
+    executor = parse_executor(f"dask:{cluster}")
+    pids = {pid for _, pid in executor.map(_who, list(range(8)))}
+    assert len(pids) == 2 and os.getpid() not in pids
+    assert np.array_equal(_fold_errors(lrm, executor), _fold_errors(lrm, None))
+    with pytest.raises(ConfigError, match=r"a.yaml:7: found 3\. Give another\."):
+        executor.map(_refuse, list(range(6)))
+
+
+@pytest.mark.slow
+def test_a_study_on_a_dask_cluster_finds_the_same_figures(tmp_path: Path, cluster: str) -> None:
     asked = ["study", str(CONFIGS / "study_demo.yaml"), "--set", "evaluator=interpreted", "--set", "study.folds=3"]
     told = {}
-    for place in ("1", "2"):
-        done = CliRunner().invoke(cli, [*asked, "--out", str(tmp_path / place), "--parallel", place, "--json"])
+    for place in ("1", f"dask:{cluster}"):
+        done = CliRunner().invoke(cli, [*asked, "--out", str(tmp_path / place[:4]), "--parallel", place, "--json"])
         assert done.exit_code == 0, done.output
         told[place] = json.loads(done.stdout)
     one, other = told.values()
     figures = ("name", "free", "error_mm", "change_mm", "converged", "failed_folds")
     assert [[v[f] for f in figures] for v in one["variants"]] == [[v[f] for f in figures] for v in other["variants"]]
     assert one["lowest"] == other["lowest"]
-    assert (tmp_path / "1" / "study.csv").read_bytes() == (tmp_path / "2" / "study.csv").read_bytes()
+    assert (tmp_path / "1" / "study.csv").read_bytes() == (tmp_path / "dask" / "study.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_a_cluster_that_is_not_there_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason='needs: pip install "dask[distributed]"')
+    monkeypatch.setattr(parallel, "_DASK_TIMEOUT", "1s")
+    with pytest.raises(InputError, match="no dask scheduler answers"):
+        parse_executor("dask:tcp://127.0.0.1:1").map(_refuse, [1])
+
+
+def test_a_cluster_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match="pip install"):
+        parse_executor("dask:tcp://127.0.0.1:1").map(_refuse, [1])
 
 
 @pytest.mark.slow

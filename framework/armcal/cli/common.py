@@ -161,7 +161,7 @@ parallel = click.option(
     default="auto",
     metavar="N|BACKEND",
     callback=_executor,
-    help="Processes for independent fits: N, threading:N [default: auto].",
+    help="Processes for independent fits: N, threading:N, dask:ADDRESS [default: auto].",
 )
 
 

@@ -1,4 +1,4 @@
-"""Independent pieces of work, one after another, in processes or in threads, through joblib.
+"""Independent pieces of work, one after another, in processes, in threads or on a cluster, through joblib.
 
 A piece of work is a function of one picklable task; results come in the order of the tasks and are the same to the
 last bit wherever they were made, as long as BLAS keeps to one thread there (workers and the command line see to it).
@@ -22,8 +22,9 @@ Report = Callable[[float], None]  # Takes which fraction of the work is done
 
 WORTH_WORKERS_S = 6.0  # Starting worker processes takes a second or two: not worth it for less work than this
 _SAFE_PATH = "PYTHONSAFEPATH"
+_DASK_TIMEOUT = "10s"
 _OPTION = Location("--parallel")
-_FORMS = "auto, a number of processes or threading:N"
+_FORMS = "a number of processes, loky:N, threading:N or dask:ADDRESS"
 
 
 def unreported(fraction: float) -> None:
@@ -77,14 +78,15 @@ class Automatic:
 class Workers:
     """A joblib backend."""
 
-    backend: str = "loky"  # ``loky`` (processes) or ``threading``
-    count: int | None = None  # how many at once; as many as there are processors, if None
+    backend: str = "loky"  # ``loky`` (processes), ``threading`` or ``dask``
+    count: int | None = None  # how many at once; as many as there are processors, or the cluster's own number, if None
+    address: str = ""  # of a dask scheduler
 
     def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """As the protocol says.
 
         Raises:
-            InputError: a task cannot be sent to another process.
+            InputError: the cluster is not there, or a task cannot be sent to another process.
             ArmcalError: a worker process ended without an answer.
         """
         import joblib
@@ -115,9 +117,14 @@ class Workers:
     def _configured(self) -> Iterator[None]:
         import joblib
 
-        options: dict[str, Any] = {"backend": self.backend, "n_jobs": self.count or joblib.cpu_count()}
+        count = self.count or (joblib.cpu_count() if self.backend in ("loky", "threading") else -1)
+        options: dict[str, Any] = {"backend": self.backend, "n_jobs": count}
         if self.backend == "loky":
             options["inner_max_num_threads"] = 1
+        if self.backend == "dask":
+            with _dask_client(self.address) as client, joblib.parallel_config(**options, client=client):
+                yield
+            return
         # Processes started meanwhile do not take a file of the working directory for a library, as the command does
         # not. Loky starts them by ``python -m``, which looks there first, and has no argument for it.
         before = os.environ.get(_SAFE_PATH)
@@ -145,6 +152,8 @@ def parse_executor(text: str) -> Executor:
         backend, rest = "loky", backend
     if backend in ("loky", "threading") and rest.isdecimal() and 1 <= int(rest) <= 1024:
         return Sequential() if int(rest) == 1 else Workers(backend, int(rest))
+    if backend == "dask" and rest:
+        return Workers(backend, address=rest)
     raise InputError(f"found {text!r}, expected {_FORMS}.", where=_OPTION, hint="For example --parallel 4.")
 
 
@@ -154,3 +163,19 @@ def _picklable(what: object) -> bool:
     except Exception:  # each library has its own way of refusing
         return False
     return True
+
+
+@contextmanager
+def _dask_client(address: str) -> Iterator[Any]:
+    try:
+        from distributed import Client
+    except ImportError as fault:
+        hint = 'Install it: pip install "dask[distributed]".'
+        raise InputError(f"dask's cluster library is not there ({fault}).", where=_OPTION, hint=hint) from fault
+    try:
+        client = Client(address, timeout=_DASK_TIMEOUT, set_as_default=False)
+    except (OSError, ValueError) as fault:
+        hint = "Give the scheduler's address, such as dask:tcp://127.0.0.1:8786."
+        raise InputError(f"no dask scheduler answers at {address} ({fault}).", where=_OPTION, hint=hint) from fault
+    with client:
+        yield client
