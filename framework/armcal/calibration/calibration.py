@@ -14,8 +14,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import identity
 from armcal.calibration.calibration_file import CalibrationFile, identity_of, lost_calibration, read_record
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Commands, Options
+from armcal.calibration.compensation import Commands, Compensator, Options
 from armcal.calibration.intervals import PlusMinus, Uncertainty
 from armcal.calibration.measured_point import Point, tool_point
 from armcal.calibration.physics import (
