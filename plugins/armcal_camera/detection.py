@@ -249,7 +249,6 @@ def grown(image: Array | Grey, grid: Array, crossing: Array) -> tuple[int, int]:
     return grid.shape[1], grid.shape[0]
 
 
-VERSION = 2  # Of the detection; it changes with the corners
 _SIDES_PX = (1200, 2400)  # Largest sides of the reduced images on which boards are looked for, one after the other
 _FEWEST = 4
 _STEEPEST = math.radians(78)
@@ -264,7 +263,6 @@ class Detection:
 
     corners: Array  # of each of the board's points (P x 2, px); NaN where it was not seen
     fault: str = ""  # why the image says nothing of this board; empty if it does
-    found_size: tuple[int, int] | None = None  # columns and rows of a chessboard of another size that is there instead
     blur: float = math.nan  # standard deviation of the blur across edges (px)
     step: float = math.nan  # the mean distance of neighbouring points (px)
     oblique: float = math.nan  # the angle between the line of sight and the board's normal at its middle (rad)
@@ -308,7 +306,7 @@ def _chessboard(image: Grey, reduced: Grey, board: Board, nothing: Detection) ->
     whole = grown(image, grid, fit.crossing)
     if whole != size:
         text = f"expected {size[0]} x {size[1]} inner corners, found {whole[0]} x {whole[1]}"
-        return replace(nothing, fault=text, found_size=whole)
+        return replace(nothing, fault=text)
     hull, middle = cv2.convexHull(rough.astype(np.float32)).reshape(-1, 2), rough.reshape(-1, 2).mean(axis=0)
     outline = np.rint(middle + 1.1 * (hull - middle)).astype(np.int32)
     painted_over = cv2.fillConvexPoly(reduced.copy(), outline, int(np.percentile(reduced, 90)))
@@ -331,7 +329,7 @@ def _other_board(image: Grey, nothing: Detection) -> Detection:
         return nothing
     columns, rows = sorted(grown(image, grid, crossing), reverse=True)
     text = f"{nothing.fault}, but one of {columns} x {rows} inner corners or a part of it"
-    return replace(nothing, fault=text, found_size=(columns, rows))
+    return replace(nothing, fault=text)
 
 
 def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detection:

@@ -494,8 +494,8 @@ def reach_for(solvers: Solvers, records: Array, targets: Array, pointing: Pointi
         stated = np.concatenate([pointing.along, np.eye(3)[pointing.axis], [inside]])
         targets = np.concatenate([targets, np.repeat(stated[:, None], targets.shape[1], axis=1)])
     solver = solvers[pointing is not None]
-    found = solver(Goal(records, np.zeros((solver.states, targets.shape[1])), targets))
-    return found.commands, found.there
+    solutions = solver(Goal(records, np.zeros((solver.states, targets.shape[1])), targets))
+    return solutions.commands, solutions.there
 
 
 def _require(holds: bool, message: str, hint: str) -> None:
