@@ -33,7 +33,6 @@ from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location, NotConvergedError
-from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover
@@ -251,23 +250,16 @@ class Calibration:
             components,
         )
 
-    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
+    def plus_minus(self, commands: Dataset) -> PlusMinus:
         """How far measurements at these commands may lie from ``predict``.
 
-        In the ``same`` recording as the calibration's, with the drift that it determines, which ``shift`` adds to the
-        predicted channels.
+        Where something drifts, in another recording than the calibration's.
 
         Raises:
-            ConfigError: the calibration does not say, or was recalibrated since.
-            DataError: in the same recording, and the records do not say their place in it.
+            ConfigError: the calibration does not say.
             NotConvergedError: a record has no equilibrium.
         """
-        if recording == "same" and self.record.recalibrated is not None:
-            raise ConfigError(
-                "the calibration was updated after its recording, so the drift of that recording is not known.",
-                hint="Predict for a new recording.",
-            )
-        return self.uncertainty.plus_minus(commands, recording)
+        return self.uncertainty.plus_minus(commands)
 
     def expression(
         self,

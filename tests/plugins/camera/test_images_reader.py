@@ -24,7 +24,7 @@ from armcal_camera.pose_table import FLANGE
 from armcal_camera.render import Exposure, Lens, render
 from scipy.spatial.transform import Rotation
 
-from tests.plugins.camera.sheets import CHARUCO, SIZE, facing
+from tests.plugins.camera.sheets import CHARUCO, SIZE, facing, projected
 
 BOARD = Chessboard.si(type="chessboard", columns=5, rows=4, square=0.04)
 LENS = Lens((600.0, 600.0), (320.0, 240.0))
@@ -58,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 
 def truth(i: int) -> Any:
     pose = facing(BOARD, TURNS[i])
-    return LENS.project(BOARD.points @ pose[:3, :3].T + pose[:3, 3])
+    return projected(LENS, BOARD.points @ pose[:3, :3].T + pose[:3, 3])
 
 
 def request_of(joints: tuple[str, ...] = ("q1", "q2"), camera: Camera | None = None) -> ReadRequest:
