@@ -80,6 +80,9 @@ def board(console: Console, kind: str, paper: str, out: Path, force: bool, **siz
     console.result({"board": settings, "points": len(made.points), "files": [str(file) for file in files]})
     for file in files:
         console.line(str(file))
+    if isinstance(made, Chessboard) and (made.columns + made.rows) % 2 == 0:
+        text = f"a chessboard of {made.columns} x {made.rows} inner corners is the same upside down"
+        console.warn(f"{text}: take one count even and the other odd, as 9 x 6.")
     width, height = (1000 * extent for extent in made.extent)
     console.line(
         f"Print the PDF at 100 %. Its line must be 100 mm long, the board {width:g} x {height:g} mm: measure both."

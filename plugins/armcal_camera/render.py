@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -16,9 +16,6 @@ from armcal_camera.board import Board, dark_rectangles, outline
 from armcal_camera.hand_eye import pose_matrix
 from armcal_camera.images import Grey, opencv
 from armcal_camera.intrinsics import DISTORTION, normalised
-
-if TYPE_CHECKING:
-    from armcal_camera.camera import Camera
 
 _SAMPLES = 4  # along each side of a pixel
 _COARSE_PX = 4
@@ -128,7 +125,7 @@ def _coverage(low: float, high: float) -> tuple[slice, Array]:
 _USUAL = Exposure(blur=0.7, noise=2.0, light=0.1)
 
 
-def rendered_records(camera: Camera, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
+def rendered_records(camera: Any, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
     """The image file of each record; see ``Rendering``.
 
     Raises:
