@@ -22,7 +22,7 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Angle, Force3, InputPath, Length, Length3, Mass, Settings, Torque
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.inverse import Goal, Solver
+from armcal.calibration.inverse import Aim, Goal, Solver
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression, arm_expression
 from armcal.config.selection import with_values
 from armcal.config.system import System, build_system
@@ -483,8 +483,9 @@ Solvers = Mapping[bool, Solver]  # for positions; and (True) with a direction of
 
 
 def solvers_of(design: Design, choice: EvaluatorChoice) -> Solvers:
-    parts = design.expression, design.limits
-    return {turns: Solver(*parts, "direction" if turns else "position", _LENGTH, _ARRIVED, choice) for turns in (0, 1)}
+    aims: dict[bool, Aim] = {False: "position", True: "direction"}
+    parts = (_LENGTH, _ARRIVED, choice)
+    return {turns: Solver(design.expression, design.limits, aim, *parts) for turns, aim in aims.items()}
 
 
 def reach_for(solvers: Solvers, records: Array, targets: Array, pointing: Pointing | None = None) -> tuple[Array, Mask]:
