@@ -83,7 +83,7 @@ def board(console: Console, kind: str, paper: str, out: Path, force: bool, **siz
     if isinstance(made, Chessboard) and (made.columns + made.rows) % 2 == 0:
         text = f"a chessboard of {made.columns} x {made.rows} inner corners is the same upside down"
         console.warn(f"{text}: take one count even and the other odd, as 9 x 6.")
-    width, height = (1000 * extent for extent in made.extent)
+    width, height = (1000 * extent for extent in made.layout.extent)
     console.line(
         f"Print the PDF at 100 %. Its line must be 100 mm long, the board {width:g} x {height:g} mm: measure both."
     )
@@ -100,7 +100,7 @@ def pages_of(board: Board, paper: str) -> dict[str, bytes]:
     figure = library("matplotlib.figure", "printing a board").Figure((width / _INCH_MM, height / _INCH_MM))
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))  # a unit is a millimetre
     axes.axis("off")
-    size, low = 1000 * np.array(board.extent), 1000 * outline(board)[:2]
+    size, low = 1000 * np.array(board.layout.extent), 1000 * outline(board)[:2]
     corner = np.array([width - size[0], height - _FOOT_MM - size[1]]) / 2
     ends = 1000 * dark_rectangles(board).reshape(-1, 2, 2) - low
     if isinstance(board, Aprilgrid):  # y of these boards points up, and that of pages down
@@ -142,8 +142,8 @@ def _fill(axes: Any, rectangles: Array) -> None:
 
 def page_of(board: Board, paper: str) -> tuple[float, float]:
     """Width and height of the page (mm)."""
-    size = 1000 * np.array(board.extent)
-    quiet = 0.0 if isinstance(board, Chessboard | Charuco) else 100 * board.step  # white around tags
+    size = 1000 * np.array(board.layout.extent)
+    quiet = 0.0 if isinstance(board, Chessboard | Charuco) else 100 * board.layout.step  # white around tags
     pages = [page for page in _both(paper) if _fits(size + 2 * quiet, page)]
     if pages:
         return pages[0]

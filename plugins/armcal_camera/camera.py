@@ -28,7 +28,7 @@ from armcal_camera.mixed_up import require_board_axes, require_form, require_one
 from armcal_camera.render import rendered_records
 
 _INTRINSICS = ("fx", "fy", "cx", "cy")
-_FEWEST_VIEWS = 3
+_FEWEST_VIEWS, _MOST_VIEWS = 3, 30
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,7 @@ def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
     middle = (whole.min(axis=0) + whole.max(axis=0)) / 2
     size = float(np.max(whole.max(axis=0) - whole.min(axis=0)))
     full = [(view.points, view.image - middle) for view in _fullest(views)]
+    full = full[:: max(1, len(full) // _MOST_VIEWS)]
     solved = intrinsics(full, size) if len(full) >= _FEWEST_VIEWS else None
     off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
     if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:

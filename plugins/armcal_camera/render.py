@@ -70,7 +70,7 @@ def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, i
     for board, pose in placed:
         texels = _texels_per_metre(board, lens, pose)
         plane = pose[:3, [0, 1, 3]]
-        start = outline(board)[:2] - board.step / 2
+        start = outline(board)[:2] - board.layout.step / 2
         to_texel = np.array([[texels, 0, -texels * start[0] - 0.5], [0, texels, -texels * start[1] - 0.5], [0, 0, 1.0]])
         places = cv2.perspectiveTransform(rays, to_texel @ np.linalg.inv(plane))
         texture = exposure.white + (exposure.dark - exposure.white) * _darkness(board, start, texels)
@@ -105,11 +105,11 @@ def _texels_per_metre(board: Board, lens: Lens, pose: Array) -> float:
     nearest = float((corners @ pose.T)[:, 2].min())
     if nearest <= 0:
         raise ValueError("the board is not all in front of the camera")
-    return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.extent) + board.step))
+    return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.layout.extent) + board.layout.step))
 
 
 def _darkness(board: Board, start: Array, texels: float) -> NDArray[np.float32]:
-    width, height = (math.ceil((extent + board.step) * texels) for extent in board.extent)
+    width, height = (math.ceil((extent + board.layout.step) * texels) for extent in board.layout.extent)
     texture = np.zeros((height, width), np.float32)
     for x0, y0, x1, y1 in (dark_rectangles(board) - [*start, *start]) * texels:
         (columns, across), (rows, along) = _coverage(x0, x1), _coverage(y0, y1)
