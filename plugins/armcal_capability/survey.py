@@ -22,7 +22,7 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Angle, Force3, InputPath, Length, Length3, Mass, Settings, Torque
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.inverse import Aim, Goal, Solver
+from armcal.calibration.inverse import Aim, Goal, Manner, Solver
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression, arm_expression
 from armcal.config.selection import with_values
 from armcal.config.system import System, build_system
@@ -45,6 +45,7 @@ _WORTH_COMPILING = 20_000
 """From this many postures on, waiting for the compiler costs less than CasADi's interpreter does."""
 _LENGTH = 0.1  # metres that a radian counts for, where a tool's place and direction are taken together
 _ARRIVED = (1e-5, 5e-4)  # m, rad
+_MANNER = Manner(damping=1e-2, patience=12, steps=60)  # few starts a cell: each is followed for longer
 _INSIDE = 1e-3  # rad: how far inside the required cone the tool is brought
 _ROUND = 4  # starts at once, where one way to reach a cell is enough
 _LANES, _MM = 8, 1000.0
@@ -495,7 +496,7 @@ def reach_for(solvers: Solvers, records: Array, targets: Array, pointing: Pointi
         stated = np.concatenate([pointing.along, np.eye(3)[pointing.axis], [inside]])
         targets = np.concatenate([targets, np.repeat(stated[:, None], targets.shape[1], axis=1)])
     solver = solvers[pointing is not None]
-    solutions = solver(Goal(records, np.zeros((solver.states, targets.shape[1])), targets))
+    solutions = solver(Goal(records, np.zeros((solver.states, targets.shape[1])), targets), _MANNER)
     return solutions.commands, solutions.there
 
 
