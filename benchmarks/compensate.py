@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Commands, Options, Targets
+from armcal.calibration.compensation import Commands, Compensator, Options, Targets
 from armcal.calibration.tool_expression import arm_expression
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
@@ -82,14 +81,14 @@ def reachable(compensator: Compensator, count: int, seed: int = 0) -> Targets:
     random = np.random.default_rng(seed)
     commands = random.uniform(*compensator.limits.T, (count, len(compensator.joints)))
     nowhere = compensator.targets(np.zeros((count, 3)), payload=random.uniform(0, PAYLOAD_KG, count))
-    tools = compensator.exact(commands, nowhere.acting)
+    tools = compensator.forward(commands, nowhere.acting)
     return replace(nowhere, positions=tools[:, :3, 3], rotations=tools[:, :3, :3])
 
 
 def run() -> Iterator[Row]:
     """The rows of this benchmark."""
     arm = TrueArm.of("demo.yaml")
-    targets = reachable(arm.compensator(), TARGETS)
+    targets = reachable(arm.exact(), TARGETS)
     for kind, asked in (("poses", targets), ("positions", replace(targets, rotations=None))):
         yield from _timed(arm, kind, asked)
     few = targets.subset(np.arange(200))
@@ -188,13 +187,14 @@ def with_counts() -> Iterator[Errors]:
     """Errors that whole counts leave, by the way to command; targets are poses, errors are of the position."""
     arm = TrueArm.of("bench.yaml")
     compensator, rigid, nominal = arm.compensator(), arm.rigid(arm.parameters), arm.nominal
-    targets = reachable(compensator, ROUNDED)
+    exactly = arm.exact()
+    targets = reachable(exactly, ROUNDED)
     thought = nominal.solve(targets)
     yield Errors("nominal", _away(compensator, thought.joint_angles[thought.reached], targets, thought.reached))
     few = targets.subset(np.arange(SEARCHED))
     yield Errors("fixed point", _fixed_point(compensator, rigid, targets))
     yield Errors(f"search in the 1 cm cube ({SEARCHED} targets)", _cube(compensator, rigid, few))
-    exact = arm.exact().solve(targets)
+    exact = exactly.solve(targets)
     rounded = _away(compensator, exact.joint_angles[exact.reached], targets, exact.reached)
     yield Errors("exact commands, each joint to its nearest count", rounded)
     yield Errors("armcal, poses", compensator.solve(targets).distances)

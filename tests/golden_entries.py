@@ -476,8 +476,7 @@ ENTRIES: tuple[Entry, ...] = (
         "compensate-pose",
         "commands that reach poses, one of them too far",
         text("targets.csv", POSES),
-        "compensate runs/lrm-demo/calibration.yaml --targets {out}/targets.csv --out {out}/commands.csv --json"
-        " --redundancy least_sag",
+        "compensate runs/lrm-demo/calibration.yaml --targets {out}/targets.csv --out {out}/commands.csv --json",
         reads=["0.out", "commands.csv"],
         needs=["lrm-demo"],
     ),

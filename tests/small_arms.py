@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Options
+from armcal.calibration.compensation import Compensator, Options
 from made_calibrations import made_calibration
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -128,3 +127,10 @@ def predicted(found: Calibration, commands: np.ndarray, arm: str = "arm", **chan
     columns = {f"{arm}.{joint}": commands[:, i] for i, joint in enumerate(joints)}
     columns |= {name: np.broadcast_to(values, len(commands)) for name, values in channels.items()}
     return found.predict(Dataset(tuple(map(str, range(len(commands)))), columns))[1][0]
+
+
+def exact(found: Compensator, commands: np.ndarray, acting: np.ndarray) -> np.ndarray:
+    """base_T_tool (N x 4 x 4) where joints stand at commands to the last digit, as no board sets them."""
+    record, joints = found.expression.records(commands.T), len(found.joints)
+    record[2 * joints : 2 * joints + len(acting)] = acting
+    return found._equilibrium.required(record)

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from armcal.base.settings import Temperature as Temperature
     from armcal.base.settings import Torque as Torque
     from armcal.calibration.calibration import Calibration as Calibration
-    from armcal.calibration.compensation.compensator import Compensator as Compensator
-    from armcal.calibration.compensation.request import Commands as Commands
-    from armcal.calibration.compensation.request import Options as Options
-    from armcal.calibration.compensation.request import Targets as Targets
+    from armcal.calibration.compensation import Commands as Commands
+    from armcal.calibration.compensation import Compensator as Compensator
+    from armcal.calibration.compensation import Options as Options
+    from armcal.calibration.compensation import Targets as Targets
     from armcal.diagnose.checks import Finding as Finding
     from armcal.errors import ArmcalError as ArmcalError
     from armcal.errors import InputError as InputError
@@ -73,8 +73,7 @@ _FOR_USERS = {
     "armcal.run.result": "RunResult",
     "armcal.estimate.estimator": "Estimate",
     "armcal.calibration.calibration": "Calibration",
-    "armcal.calibration.compensation.compensator": "Compensator",
-    "armcal.calibration.compensation.request": "Commands Options Targets",
+    "armcal.calibration.compensation": "Commands Compensator Options Targets",
 }
 """What runs and uses calibrations."""
 _FOR_PLUGINS = {

@@ -67,11 +67,12 @@ class Board(Settings):
 
     @property
     def layout(self) -> Layout:
+        """What is printed of it."""
         raise NotImplementedError
 
     @model_validator(mode="after")
     def _with_enough_tags(self) -> Self:
-        family, ids = self.tag_family, self.tag_ids
+        family, ids = self.layout.tag_family, self.layout.tag_ids
         known = tags_in(family) if family else 0
         if ids.stop > known:
             up_to = f"ids up to {ids.stop - 1}"
@@ -82,27 +83,6 @@ class Board(Settings):
     def points(self) -> Array:
         """Where its points are (P x 3, m)."""
         return self.layout.points
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        return self.layout.extent
-
-    @property
-    def step(self) -> float:
-        return self.layout.step
-
-    @property
-    def reach(self) -> float:
-        """How far around a point there are only the edges that cross there (m)."""
-        return self.layout.reach
-
-    @property
-    def tag_family(self) -> str:
-        return self.layout.tag_family
-
-    @property
-    def tag_ids(self) -> range:
-        return self.layout.tag_ids
 
     @property
     def tag_corners(self) -> Array:
@@ -291,9 +271,10 @@ def require_distinct(boards: Sequence[Board]) -> None:
     """
     for index, board in enumerate(boards):
         for other in boards[:index]:
-            shared = set(board.tag_ids) & set(other.tag_ids) if board.tag_family == other.tag_family else set()
+            own, others = board.layout, other.layout
+            shared = set(own.tag_ids) & set(others.tag_ids) if own.tag_family == others.tag_family else set()
             if shared:
-                tags = f"the tag {min(shared)} of {board.tag_family}"
+                tags = f"the tag {min(shared)} of {own.tag_family}"
                 raise ValueError(f"two boards have {tags}: give each its own ids, by first_id or id")
             if isinstance(board, Chessboard) and isinstance(other, Chessboard):
                 same = {board.columns, board.rows} == {other.columns, other.rows}
@@ -327,7 +308,7 @@ def outline(board: Board) -> Array:
     low = board.points[:, :2].min(axis=0)
     if isinstance(board, Chessboard | Charuco):
         low = np.array([-board.square, -board.square])
-    return np.array([*low, *(low + board.extent)])
+    return np.array([*low, *(low + board.layout.extent)])
 
 
 def _squares(board: Board) -> Array:
@@ -342,12 +323,12 @@ def _squares(board: Board) -> Array:
 
 def _tags(board: Board) -> list[Array]:
     """Of each tag the dark cells, those side by side as one."""
-    if not len(board.tag_ids):
+    layout, border = board.layout, getattr(board, "border_bits", 1)
+    if not len(layout.tag_ids):
         return []
-    border = getattr(board, "border_bits", 1)
-    family, cells = dictionary(board.tag_family), tag_modules(board.tag_family, border)
+    family, cells = dictionary(layout.tag_family), tag_modules(layout.tag_family, border)
     parts = []
-    for number, corners in zip(board.tag_ids, board.tag_corners[:, :, :2], strict=True):
+    for number, corners in zip(layout.tag_ids, board.tag_corners[:, :, :2], strict=True):
         image = opencv().aruco.generateImageMarker(family, number, cells, borderBits=border)
         edges = np.diff(np.pad(image == 0, ((0, 0), (1, 1))).astype(int), axis=1)
         (row, start), (_, stop) = np.nonzero(edges == 1), np.nonzero(edges == -1)

@@ -15,20 +15,20 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import PoseSettings, pose_transform
-from armcal.base.quaternions import quaternion_of, rotation_matrix
+from armcal.base.quaternions import quaternion_of
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings, PointInstrument, Proposal, Reading, spread_points
 from armcal.measure.measurement import Channel, Mistake
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
-from armcal_camera.hand_eye import FEWEST_POINTS, board_pose, hand_eye, homography, intrinsics, open_motion, sentence
+from armcal_camera.hand_eye import FEWEST_POINTS, board_pose, hand_eye, intrinsics, open_motion, pose_matrix
 from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, normalised, projected
 from armcal_camera.mixed_up import require_board_axes, require_form, require_one_board
 from armcal_camera.render import rendered_records
 
 _INTRINSICS = ("fx", "fy", "cx", "cy")
-_FEWEST_VIEWS = 3
+_FEWEST_VIEWS, _MOST_VIEWS = 3, 30
 
 
 @dataclass(frozen=True)
@@ -101,31 +101,16 @@ def _places(
             solved = hand_eye(a, np.linalg.inv(b))
             if solved is None and not is_known:
                 continue
-            every = np.linalg.inv(a) @ _matrix(name, own) @ np.linalg.inv(b)
+            every = np.linalg.inv(a) @ pose_matrix(name, own) @ np.linalg.inv(b)
             camera_pose = every[_middle(every)] if solved is None else solved.x
-            board_pose_ = _matrix(name, own) if solved is None else solved.y
+            board_pose_ = pose_matrix(name, own) if solved is None else solved.y
             proposed |= _pose_values("camera", camera_pose)
         else:
-            every = a @ (_matrix("camera", own) if camera_pose is None else camera_pose) @ b
+            every = a @ (pose_matrix("camera", own) if camera_pose is None else camera_pose) @ b
             board_pose_ = every[_middle(every)]
         if _placed(name, free):
             proposed |= _pose_values(name, board_pose_)
     return proposed
-
-
-def certified_place(setup: Setup, reading: Reading) -> str:
-    """Whether another place of the camera fits the poses of the board seen most better; empty without a question."""
-    values = reading.values
-    if setup.frames[0] == setup.frames[1] or not _placed("camera", reading.free):
-        return ""
-    boards = zip(setup.names, _poses(setup, _views(setup, reading), values), strict=True)
-    name, poses = max(boards, key=lambda board: len(board[1]))
-    moved = _moved(setup, reading)[list(poses)]
-    seen = np.linalg.inv(np.array(list(poses.values())).reshape(-1, 4, 4))
-    solved = hand_eye(moved, seen)
-    if solved is None:
-        return "that no other place of the camera is better could not be shown: the motions leave it open."
-    return sentence(moved[solved.kept], seen[solved.kept], solved, (_matrix("camera", values), _matrix(name, values)))
 
 
 def _moved(setup: Setup, reading: Reading) -> Array:
@@ -167,12 +152,13 @@ def _fullest(views: Sequence[_View]) -> list[_View]:
 
 
 def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
-    """Those that homographies determine; where they do not, a lens of ordinary width about the middle."""
+    """Those that views determine; where they do not, a lens of ordinary width about the middle."""
     whole = np.concatenate([view.image for view in views]) if views else np.array([[0.5, 0.5]])
     middle = (whole.min(axis=0) + whole.max(axis=0)) / 2
     size = float(np.max(whole.max(axis=0) - whole.min(axis=0)))
-    full = _fullest(views)
-    solved = intrinsics([homography(v.points, v.image - middle) for v in full]) if len(full) >= _FEWEST_VIEWS else None
+    full = [(view.points, view.image - middle) for view in _fullest(views)]
+    full = full[:: max(1, len(full) // _MOST_VIEWS)]
+    solved = intrinsics(full, size) if len(full) >= _FEWEST_VIEWS else None
     off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
     if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:
         solved = (1.2 * size, 1.2 * size, 0.0, 0.0)
@@ -190,13 +176,6 @@ def _poses(setup: Setup, views: list[_View], values: Mapping[str, Array]) -> lis
         seen = normalised(lens, view.image.T, focal, centre, distortion).T
         poses[view.board][view.record] = board_pose(view.points, seen)
     return poses
-
-
-def _matrix(name: str, values: Mapping[str, Array]) -> Array:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(np.asarray(values[f"{name}_rotation"]))
-    pose[:3, 3] = [float(values[f"{name}_{axis}"][0]) for axis in "xyz"]
-    return pose
 
 
 def _pose_values(name: str, pose: Array) -> dict[str, Array]:
@@ -225,7 +204,7 @@ class CameraSettings(InstrumentSettings):
     intrinsics that are not stated are found from the images, where they are free. ``boards_of`` names another
     camera that sees the same boards in the same places: their poses and scale are then that one's parameters. Of a
     board with more than ``most_points`` points so many are used, spread evenly over it. ``image`` is its width and
-    height. ``certificate`` shows that no other place of the camera fits the poses of the board better (cvxpy).
+    height.
     """
 
     noise: Annotated[Pixels, Field(gt=0)]
@@ -241,7 +220,6 @@ class CameraSettings(InstrumentSettings):
     boards_of: str | None = None
     image: tuple[Pixels, Pixels] | None = None
     most_points: Annotated[int, Field(ge=4)] = 120
-    certificate: bool = True
 
     @model_validator(mode="after")
     def _complete(self) -> CameraSettings:
@@ -484,10 +462,6 @@ class Camera(PointInstrument):
     def propose(self, reading: Reading) -> Proposal:
         """Where a fit may start, from the images alone; see ``Proposing``."""
         return first_guess(self._setup, reading)
-
-    def certificate(self, reading: Reading) -> str:
-        """Whether no other place of the camera fits the poses of the board better; see ``Certifying``."""
-        return certified_place(self._setup, reading) if self.settings.certificate else ""
 
     @property
     def _setup(self) -> Setup:

@@ -249,7 +249,6 @@ def grown(image: Array | Grey, grid: Array, crossing: Array) -> tuple[int, int]:
     return grid.shape[1], grid.shape[0]
 
 
-VERSION = 2  # Of the detection; it changes with the corners
 _SIDES_PX = (1200, 2400)  # Largest sides of the reduced images on which boards are looked for, one after the other
 _FEWEST = 4
 _STEEPEST = math.radians(78)
@@ -264,9 +263,7 @@ class Detection:
 
     corners: Array  # of each of the board's points (P x 2, px); NaN where it was not seen
     fault: str = ""  # why the image says nothing of this board; empty if it does
-    found_size: tuple[int, int] | None = None  # columns and rows of a chessboard of another size that is there instead
     blur: float = math.nan  # standard deviation of the blur across edges (px)
-    step: float = math.nan  # the mean distance of neighbouring points (px)
     oblique: float = math.nan  # the angle between the line of sight and the board's normal at its middle (rad)
 
 
@@ -308,7 +305,7 @@ def _chessboard(image: Grey, reduced: Grey, board: Board, nothing: Detection) ->
     whole = grown(image, grid, fit.crossing)
     if whole != size:
         text = f"expected {size[0]} x {size[1]} inner corners, found {whole[0]} x {whole[1]}"
-        return replace(nothing, fault=text, found_size=whole)
+        return replace(nothing, fault=text)
     hull, middle = cv2.convexHull(rough.astype(np.float32)).reshape(-1, 2), rough.reshape(-1, 2).mean(axis=0)
     outline = np.rint(middle + 1.1 * (hull - middle)).astype(np.int32)
     painted_over = cv2.fillConvexPoly(reduced.copy(), outline, int(np.percentile(reduced, 90)))
@@ -331,7 +328,7 @@ def _other_board(image: Grey, nothing: Detection) -> Detection:
         return nothing
     columns, rows = sorted(grown(image, grid, crossing), reverse=True)
     text = f"{nothing.fault}, but one of {columns} x {rows} inner corners or a part of it"
-    return replace(nothing, fault=text, found_size=(columns, rows))
+    return replace(nothing, fault=text)
 
 
 def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detection:
@@ -352,15 +349,15 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
         return replace(nothing, fault=f"{text}: check its columns, rows, spacing and first_id")
     corners_known, points = known.reshape(-1, 2), board.points[:, :2]
     away = np.linalg.norm(points[:, None] - corners_known[None], axis=2).min(axis=1)
-    near = np.flatnonzero(away < (0.99 * board.step if isinstance(board, Charuco) else 1e-9))
+    near = np.flatnonzero(away < (0.99 * board.layout.step if isinstance(board, Charuco) else 1e-9))
     rough, scale = local_map(corners_known, pixels.reshape(-1, 2), points[near])
-    fit = refine(image, rough, scale, board.reach)
+    fit = refine(image, rough, scale, board.layout.reach)
     corners = nothing.corners.copy()
     corners[near] = fit.corners
     there = points[np.isfinite(corners[:, 0])]
     count = len(there)
     # in a line they do not say how the board lies
-    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * board.step:
+    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * board.layout.step:
         return replace(nothing, fault=f"too few corners of the {board.kind} were found ({count} of {len(points)})")
     return replace(nothing, corners=corners, fault="", blur=float(np.nanmedian(fit.blur)))
 
@@ -376,14 +373,15 @@ def _astray(known: Array, pixels: Array) -> int:
 
 
 def _other_tags(reduced: Grey, board: Board, nothing: Detection) -> Detection:
+    layout, border = board.layout, getattr(board, "border_bits", 1)
     reliable = (family for family in FAMILIES if family != "16h5")  # it is seen in anything
-    for family in (board.tag_family, *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)), *reliable):
-        ids = _detected(reduced, family, getattr(board, "border_bits", 1))[1]
+    for family in (layout.tag_family, *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)), *reliable):
+        ids = _detected(reduced, family, border)[1]
         if len(set(ids)) >= _FEWEST:
             name = family
             if family.endswith("_1000"):
                 name = family.replace("1000", str(min(count for count in (50, 100, 250, 1000) if count > max(ids))))
-            stated = f"those of the board are {board.tag_ids[0]} to {board.tag_ids[-1]} of {board.tag_family}"
+            stated = f"those of the board are {layout.tag_ids[0]} to {layout.tag_ids[-1]} of {layout.tag_family}"
             return replace(nothing, fault=f"{nothing.fault}, but tags {min(ids)} to {max(ids)} of {name}; {stated}")
     return nothing
 
@@ -398,12 +396,13 @@ def _detected(reduced: Grey, family: str, border_bits: int) -> tuple[Any, list[i
 
 def _seen_tags(reduced: Grey, board: Board) -> tuple[list[int], Array, tuple[int, int] | None]:
     """Which of the board's tags are seen (T), their corners (T x 4 x 2, px), and an id that stands there twice."""
-    corners, ids = _detected(reduced, board.tag_family, getattr(board, "border_bits", 1))
-    ours = [(i, c) for i, c in zip(ids, corners, strict=True) if i in board.tag_ids]
+    layout = board.layout
+    corners, ids = _detected(reduced, layout.tag_family, getattr(board, "border_bits", 1))
+    ours = [(i, c) for i, c in zip(ids, corners, strict=True) if i in layout.tag_ids]
     numbers = [i for i, _ in ours]
     double = next(((i, numbers.count(i)) for i in numbers if numbers.count(i) > 1), None)
     places = np.array([c.reshape(4, 2) for _, c in ours]).reshape(-1, 4, 2)
-    return [board.tag_ids.index(i) for i in numbers], places, double
+    return [layout.tag_ids.index(i) for i in numbers], places, double
 
 
 def _turned(known: Array, pixels: Array) -> tuple[Array, float]:
@@ -432,8 +431,8 @@ def _judged(detection: Detection, board: Board) -> Detection:
     points = board.points[seen, :2]
     _, scale = local_map(points, detection.corners[seen], points.mean(axis=0)[None])
     large, small = np.linalg.svd(scale[0], compute_uv=False)
-    oblique, narrow = math.acos(min(1.0, small / large)), small * board.step
-    result = replace(detection, step=math.sqrt(large * small) * board.step, oblique=oblique)
+    oblique, narrow = math.acos(min(1.0, small / large)), small * board.layout.step
+    result = replace(detection, oblique=oblique)
     fault = ""
     if oblique > _STEEPEST:
         fault = f"it is seen too obliquely ({math.degrees(oblique):.0f} deg, at most {math.degrees(_STEEPEST):.0f})"

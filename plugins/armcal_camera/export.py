@@ -1,6 +1,6 @@
 """Calibrated cameras in the formats of others: ROS ``camera_info``, OpenCV's YAML, and where the camera sits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from armcal.errors import ConfigError
 from scipy.spatial.transform import Rotation
 
 from armcal_camera.camera import carrying_frames
+from armcal_camera.images import opencv
 from armcal_camera.intrinsics import DISTORTION
 
 _PX = 1000.0
@@ -103,17 +104,18 @@ class OpenCvExporter(_CameraExporter):
         """
         _, camera = self._camera(request)
         matrix, distortion, size = _intrinsics(camera)
-        lines = ["%YAML:1.0", "---"]
-        if size is not None:
-            lines += [f"image_width: {size[0]}", f"image_height: {size[1]}"]
-        lines += _opencv_matrix("camera_matrix", matrix)
-        lines += _opencv_matrix("distortion_coefficients", np.array([distortion]))
+        cv2 = opencv()
+        storage = cv2.FileStorage("camera.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+        for key, length in zip(("image_width", "image_height"), size or (), strict=False):
+            storage.write(key, length)
+        storage.write("camera_matrix", matrix)
+        storage.write("distortion_coefficients", np.array([distortion]))
         frames = _frames(camera)
-        lines += _opencv_matrix(f"{frames[0]}_T_camera", _pose("camera", camera.numbers))
+        storage.write(f"{frames[0]}_T_camera", _pose("camera", camera.numbers))
         turned = (entry.removesuffix("_rotation[w]") for entry in camera.numbers if entry.endswith("_rotation[w]"))
         for board in (name for name in turned if name.startswith("board")):
-            lines += _opencv_matrix(f"{frames[1]}_T_{board}", _pose(board, camera.numbers))
-        return Exported(("\n".join(lines) + "\n").encode(), 4 + len(distortion))
+            storage.write(f"{frames[1]}_T_{board}", _pose(board, camera.numbers))
+        return Exported(storage.releaseAndGetString().encode(), 4 + len(distortion))
 
 
 class HandEyeExporter(_CameraExporter):
@@ -201,13 +203,6 @@ def _pose(name: str, numbers: Mapping[str, float]) -> Array:
     turned = [numbers[f"{name}_rotation[{axis}]"] for axis in "xyzw"]
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat(turned).as_matrix(), [numbers[f"{name}_{axis}"] for axis in "xyz"]
     return pose
-
-
-def _opencv_matrix(name: str, matrix: Array) -> Sequence[str]:
-    data = ", ".join(repr(float(x)) for x in matrix.ravel())
-    rows, columns = matrix.shape
-    kinds = [f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
-    return [f"{name}: !!opencv-matrix", *kinds]
 
 
 def _urdf_joint(parent: str, child: str, pose: Array) -> str:

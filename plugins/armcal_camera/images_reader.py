@@ -9,26 +9,20 @@ centre of an image's first pixel is at 0, 0.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-import os
 import re
-import tempfile
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from armcal.base.arrays import Array
-from armcal.base.config_text import as_json
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
-from armcal.functions.compiler import cache_directory
 from armcal.io.parallel import Automatic, Report
 from armcal.io.plain_files import input_bytes, refuse, write_over
 from armcal.measure.reader import ReadRequest
@@ -36,8 +30,8 @@ from armcal.measure.tables import open_table
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board
-from armcal_camera.detection import VERSION, Detection, detect
-from armcal_camera.images import MOST_BYTES, grey_image, is_image, opencv
+from armcal_camera.detection import detect
+from armcal_camera.images import MOST_BYTES, grey_image, is_image
 from armcal_camera.pose_table import read_poses
 
 COLUMNS = ("image", "board", "point", "u_px", "v_px")
@@ -99,49 +93,6 @@ def _count(path: Path, line: int, column: str, cell: str, number: int) -> int:
         message = f"found {text[:40]!r}, expected a whole number from 0 to {number - 1}."
         refuse(path, message, "Check which board of the measurement it is, and count from 0.", line, column)
     return int(text)
-
-
-_KEPT = 20_000
-
-
-def detection_key(content: bytes, board: Board) -> str:
-    rest = json.dumps([board.to_config(), VERSION, opencv().__version__])
-    return hashlib.sha256(content + rest.encode()).hexdigest()[:40]
-
-
-def kept_detection(key: str, board: Board) -> Detection | None:
-    """A detection that was kept; None if there is none that is whole."""
-    path = _place(key)
-    with suppress(OSError, ValueError, TypeError, KeyError):
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        corners = np.array(stored.pop("corners"), dtype=float).reshape(-1, 2)
-        size = stored.pop("found_size")
-        numbers: dict[str, Any] = {name: np.nan if value is None else value for name, value in stored.items()}
-        if corners.shape == (len(board.points), 2):
-            os.utime(path)
-            return Detection(corners, found_size=None if size is None else tuple(size), **numbers)
-    return None
-
-
-def keep_detection(key: str, detection: Detection) -> None:
-    """Keep it, whole or not at all; a disk that is full or read-only costs nothing but time."""
-    path = _place(key)
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8") as file:
-            file.write(as_json({**asdict(detection), "corners": detection.corners.tolist()}, indent=None))
-        Path(file.name).replace(path)
-
-
-def forget_old() -> None:
-    with suppress(OSError):
-        files = sorted(_place("").parent.glob("*"), key=lambda path: path.stat().st_mtime, reverse=True)
-        for path in files[_KEPT:]:
-            path.unlink()
-
-
-def _place(key: str) -> Path:
-    return cache_directory() / "corners" / f"{key}.json"
 
 
 _FEWEST = 3
@@ -249,7 +200,6 @@ class ImagesReader:
         paths = _images_in(folder)
         made = Automatic().map(partial(look, boards), paths, report)
         views = {path.name: replace(view, path=str(path)) for path, view in zip(paths, made, strict=True)}
-        forget_old()
         if corners is not None:
             seen = {name: view.corners for name, view in _of_one_size(views).items() if not view.fault}
             write_over({corners: corners_text(seen, boards).encode()})
@@ -277,20 +227,13 @@ def look(boards: Sequence[Board], path: Path) -> View:
 
 
 def look_at(boards: Sequence[Board], content: bytes, name: str) -> View:
-    """What an image file's content says of boards; from what was kept, if it was looked at before."""
+    """What an image file's content says of boards."""
     digest, nothing = hashlib.sha256(content).hexdigest(), np.full((sum(len(b.points) for b in boards), 2), np.nan)
-    keys = [detection_key(content, board) for board in boards]
-    detections = [kept_detection(key, board) for key, board in zip(keys, boards, strict=True)]
     try:
         image = grey_image(content, name)
     except DataError as fault:
         return View(nothing, fault.message.rstrip("."), sha256=digest)
-    made: list[Detection] = []
-    for key, board, kept in zip(keys, boards, detections, strict=True):
-        detection = kept or detect(image, board)
-        if kept is None:
-            keep_detection(key, detection)
-        made.append(detection)
+    made = [detect(image, board) for board in boards]
     seen = [detection for detection in made if not detection.fault]
     if not seen:
         return View(nothing, "; ".join(d.fault for d in made), image.shape[::-1], sha256=digest)
@@ -412,8 +355,7 @@ def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: s
     pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in views]
     channels = corner_channels(camera, np.stack(pixels, axis=1), known)
     digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in views)]).encode()).hexdigest()
-    files = {**dataset.files, camera: tuple(view.path for view in views)}
-    return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest, files=files)
+    return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest)
 
 
 def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:

@@ -90,7 +90,9 @@ def _of_kalibr(content: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _with_model(path: str | Path, content: Mapping[str, Any], made: Mapping[str, Any]) -> IntrinsicsSettings:
-    stated = str(content.get("distortion_model", "plumb_bob")).lower()
+    stated, distortion = str(content.get("distortion_model", "plumb_bob")).lower(), tuple(made["distortion"])
+    if stated == "rational_polynomial" and not any(distortion[5:]):  # k4 to k6 are zero
+        stated, distortion = "plumb_bob", distortion[:5]
     if stated not in _FISHEYE | _PINHOLE:
         known = ", ".join(sorted(_FISHEYE | _PINHOLE))
         raise _refused(path, f"found the distortion model {stated!r}, expected one of {known}.")
@@ -99,7 +101,7 @@ def _with_model(path: str | Path, content: Mapping[str, Any], made: Mapping[str,
     numbers = {key: x / 1000 for key, x in zip(("fx", "fy", "cx", "cy"), made["numbers"], strict=True)}
     return IntrinsicsSettings.si(
         **numbers,
-        distortion=tuple(made["distortion"]),
+        distortion=distortion,
         model="fisheye" if stated in _FISHEYE else "pinhole",
         image=tuple(x / 1000 for x in size) if known_size else None,
     )

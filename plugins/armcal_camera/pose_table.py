@@ -19,14 +19,16 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.effects import JOINT_RATE
 from armcal.arm.model import Attachment, Chain, Joint
+from armcal.arm.statics import Environment
 from armcal.base import se3
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.parameters import ParameterBlock
+from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.quaternions import nearest_rotation
 from armcal.base.settings import Settings
 from armcal.base.units import DIMENSIONLESS, split_suffix
-from armcal.calibration.exporter import rigid_tools
+from armcal.calibration.compensation import Options, nominal_arm
+from armcal.calibration.inverse import different
 from armcal.errors import DataError
 from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.checks import read_as
@@ -39,11 +41,7 @@ from scipy.spatial.transform import Rotation
 
 _STILL = (0.0, 0.0, 0.0)
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_STARTS, _STEPS, _SEED = 96, 40, 1
-_REACHED, _STEP, _LONGEST = 1e-7, 1e-6, 0.5
-_SAME = 1e-3
-_LENGTH_M = 0.3  # A turn of 1 rad counts as much as this distance
-_AT_ONCE = 40
+_STARTS = 96
 
 
 class FlangePoseSettings(Settings):
@@ -84,52 +82,15 @@ def recovered_joints(arm: Arm, poses: Array, near: Array) -> tuple[Array, Array]
     Returns:
         Commands, NaN where no posture within the joints' limits reaches a pose; and the numbers of postures.
     """
-    random, count = np.random.default_rng(_SEED), len(arm.commanded)
-    limits = [joint.limits or (-np.pi, np.pi) for joint in arm.nominal_chain.joints if joint.mimic is None]
-    low, high = np.array(limits).T
-    starts = random.uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi), (_STARTS, count)).T
-    options: list[Array] = []
-    for first in range(0, len(poses), _AT_ONCE):
-        some = poses[first : first + _AT_ONCE]
-        reached = _led(arm, np.tile(starts, len(some)), np.repeat(some, _STARTS, axis=0), (low, high))
-        options += [_different(part.T) for part in np.split(reached, len(some), axis=1)]
+    nominal = nominal_arm(arm, Parameters(tuple(arm.parameters())), Environment(_STILL), Options())
+    targets = nominal.targets(poses[:, :3, 3], poses[:, :3, :3])
+    turning = np.array([kind == "angle" for kind in arm.commanded.values()])[:, None]
+    endless = turning & ~np.isfinite(nominal.limits).all(axis=1, keepdims=True)
+    options = list[Array]()
+    for commands in nominal.postures(targets, _STARTS):
+        wrapped = np.where(endless, (commands + np.pi) % (2 * np.pi) - np.pi, commands)
+        options.append(different(wrapped).T)
     return _shortest(options, near), np.array([len(own) for own in options])
-
-
-def _led(arm: Arm, commands: Array, targets: Array, limits: tuple[Array, Array]) -> Array:
-    """Commands (n x M) led to their targets by damped steps; NaN where they did not get there, or beyond limits."""
-    values = {block.name: np.array(block.nominal) for block in arm.parameters()}
-    turning = np.array([kind == "angle" for kind in arm.commanded.values()])
-    for _ in range(_STEPS):
-        off = _off(rigid_tools(arm, values, commands), targets)
-        columns = []
-        for joint in range(len(commands)):
-            moved = commands.copy()
-            moved[joint] += _STEP
-            columns.append((_off(rigid_tools(arm, values, moved), targets) - off) / _STEP)
-        slopes = np.stack(columns, axis=2)
-        normal = slopes.transpose(0, 2, 1) @ slopes + 1e-9 * np.eye(len(commands))
-        step = -np.linalg.solve(normal, slopes.transpose(0, 2, 1) @ off[:, :, None])[:, :, 0].T
-        commands = commands + step * np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(axis=0), 1e-12))
-    there = np.linalg.norm(_off(rigid_tools(arm, values, commands), targets), axis=1) < _REACHED
-    wrapped = (commands + np.pi) % (2 * np.pi) - np.pi
-    commands = np.where(turning[:, None], wrapped, commands)
-    inside = np.all((commands >= limits[0][:, None] - _SAME) & (commands <= limits[1][:, None] + _SAME), axis=0)
-    return np.where(there & inside, commands, np.nan)
-
-
-def _off(tools: Array, targets: Array) -> Array:
-    """How far tools are from targets: distance (m), and turn at a length (M x 6)."""
-    turns = Rotation.from_matrix(np.swapaxes(targets[:, :3, :3], 1, 2) @ tools[:, :3, :3]).as_rotvec()
-    return np.concatenate([tools[:, :3, 3] - targets[:, :3, 3], _LENGTH_M * turns], axis=1)
-
-
-def _different(commands: Array) -> Array:
-    kept: list[Array] = []
-    for row in commands[np.isfinite(commands).all(axis=1)]:
-        if all(np.abs(row - other).max() > _SAME for other in kept):
-            kept.append(row)
-    return np.array(kept).reshape(-1, commands.shape[1])
 
 
 def _shortest(options: list[Array], near: Array) -> Array:

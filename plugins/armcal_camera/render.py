@@ -1,77 +1,41 @@
 """Images of boards from a stated truth: a printed pattern through a lens, with blur, light and noise."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import ConfigError
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from armcal_camera.board import Board, dark_rectangles, outline
+from armcal_camera.hand_eye import pose_matrix
 from armcal_camera.images import Grey, opencv
-from armcal_camera.intrinsics import DISTORTION
+from armcal_camera.intrinsics import DISTORTION, normalised
 
 _SAMPLES = 4  # along each side of a pixel
 _COARSE_PX = 4
 _MARGIN = 1  # coarse steps
 _MOST_TEXELS = 8192
-_ROUNDS = 12
-_WIDEST = 1.5  # rad from the axis
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How rays become pixels.
-
-    Attributes:
-        distortion: k1, k2, p1, p2, k3 by Brown and Conrady, or k1 to k4 of a fisheye by Kannala and Brandt.
-    """
+    """How rays become pixels; the first pixel's centre is at 0, 0."""
 
     focal: tuple[float, float]  # fx, fy (px)
-    centre: tuple[float, float]  # cx, cy (px; the first pixel's centre is at 0, 0)
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    is_fisheye: bool = False  # which of the two
-
-    def project(self, points: Array) -> Array:
-        """Pixels (N x 2) of points in the camera's frame (N x 3, m; z along the line of sight)."""
-        ahead = self._distorted(points[:, :2] / points[:, 2:])
-        return np.asarray(ahead * np.array(self.focal) + np.array(self.centre))
+    centre: tuple[float, float]  # cx, cy (px)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)  # in the order of ``DISTORTION``
+    model: str = "pinhole"  # or fisheye
 
     def rays(self, pixels: Array) -> Array:
-        """x/z and y/z of the rays to pixels (N x 2), by fixed-point iteration."""
-        seen = (pixels - np.array(self.centre)) / np.array(self.focal)
-        if self.is_fisheye:
-            angle = radius = np.linalg.norm(seen, axis=1)
-            for _ in range(_ROUNDS):
-                angle = np.clip(angle - (self._bent(angle) - radius), 0.0, _WIDEST)
-            return np.asarray(seen * (np.tan(angle) / np.where(radius > 0, radius, 1.0))[:, None])
-        ray = seen
-        for _ in range(_ROUNDS):
-            ray = ray - (self._distorted(ray) - seen)
-        return np.asarray(ray)
-
-    def _distorted(self, ray: Array) -> Array:
-        x, y = ray.T
-        square = x**2 + y**2
-        if self.is_fisheye:
-            radius = np.sqrt(square)
-            angle = np.arctan(radius)
-            return np.asarray(ray * (self._bent(angle) / np.where(radius > 0, radius, 1.0))[:, None])
-        k1, k2, p1, p2, k3 = self.distortion
-        radial = 1 + square * (k1 + square * (k2 + square * k3))
-        across = np.stack(
-            [2 * p1 * x * y + p2 * (square + 2 * x**2), p1 * (square + 2 * y**2) + 2 * p2 * x * y], axis=1
-        )
-        return np.asarray(ray * radial[:, None] + across)
-
-    def _bent(self, angle: Array) -> Array:
-        k1, k2, k3, k4 = self.distortion
-        square = angle**2
-        return np.asarray(angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))))
+        """x/z and y/z of the rays to pixels (N x 2)."""
+        numbers = (np.array(part) for part in (self.focal, self.centre, self.distortion))
+        return normalised(self.model, pixels.T, *numbers).T
 
 
 @dataclass(frozen=True)
@@ -106,7 +70,7 @@ def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, i
     for board, pose in placed:
         texels = _texels_per_metre(board, lens, pose)
         plane = pose[:3, [0, 1, 3]]
-        start = outline(board)[:2] - board.step / 2
+        start = outline(board)[:2] - board.layout.step / 2
         to_texel = np.array([[texels, 0, -texels * start[0] - 0.5], [0, texels, -texels * start[1] - 0.5], [0, 0, 1.0]])
         places = cv2.perspectiveTransform(rays, to_texel @ np.linalg.inv(plane))
         texture = exposure.white + (exposure.dark - exposure.white) * _darkness(board, start, texels)
@@ -141,11 +105,11 @@ def _texels_per_metre(board: Board, lens: Lens, pose: Array) -> float:
     nearest = float((corners @ pose.T)[:, 2].min())
     if nearest <= 0:
         raise ValueError("the board is not all in front of the camera")
-    return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.extent) + board.step))
+    return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.layout.extent) + board.layout.step))
 
 
 def _darkness(board: Board, start: Array, texels: float) -> NDArray[np.float32]:
-    width, height = (math.ceil((extent + board.step) * texels) for extent in board.extent)
+    width, height = (math.ceil((extent + board.layout.step) * texels) for extent in board.layout.extent)
     texture = np.zeros((height, width), np.float32)
     for x0, y0, x1, y1 in (dark_rectangles(board) - [*start, *start]) * texels:
         (columns, across), (rows, along) = _coverage(x0, x1), _coverage(y0, y1)
@@ -161,24 +125,7 @@ def _coverage(low: float, high: float) -> tuple[slice, Array]:
 _USUAL = Exposure(blur=0.7, noise=2.0, light=0.1)
 
 
-class _Seeing(Protocol):
-    """What is needed of the measurement ``camera``."""
-
-    @property
-    def settings(self) -> Any: ...
-    @property
-    def boards(self) -> Sequence[Board]: ...
-    @property
-    def board_names(self) -> Sequence[str]: ...
-    @property
-    def camera_frame(self) -> str: ...
-    @property
-    def board_frame(self) -> str: ...
-    @property
-    def image(self) -> tuple[float, float] | None: ...
-
-
-def rendered_records(camera: _Seeing, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
+def rendered_records(camera: Any, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
     """The image file of each record; see ``Rendering``.
 
     Raises:
@@ -191,23 +138,15 @@ def rendered_records(camera: _Seeing, frames: Mapping[str, Array], values: Mappi
     size = [kpx * x for x in camera.image] if camera.image else [2 * x for x in centre]
     model = camera.settings.model
     distortion = tuple(float(values[name][0]) for name in DISTORTION[model])
-    lens = Lens((focal[0], focal[1]), (centre[0], centre[1]), distortion, model == "fisheye")
+    lens = Lens((focal[0], focal[1]), (centre[0], centre[1]), distortion, model)
     scale = float(values["board_scale"][0])
     carried = np.linalg.inv(frames[camera.camera_frame]) @ frames[camera.board_frame]
-    for number, to_camera in enumerate(np.linalg.inv(_pose("camera", values)) @ carried):
+    for number, to_camera in enumerate(np.linalg.inv(pose_matrix("camera", values)) @ carried):
         placed = []
         for board, name in zip(camera.boards, camera.board_names, strict=True):
-            there = to_camera @ _pose(name, values)
+            there = to_camera @ pose_matrix(name, values)
             there[:3, 3] /= scale  # the whole picture of a larger board is that of one nearer by
             placed.append((board, there))
         exposure = Exposure(_USUAL.blur, _USUAL.noise, _USUAL.light, seed=number)
         image = render(placed, lens, (round(size[0]), round(size[1])), exposure)
         yield opencv().imencode(".png", image)[1].tobytes()
-
-
-def _pose(name: str, values: Mapping[str, Array]) -> Array:
-    """4 x 4 (m)."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(values[f"{name}_rotation"], scalar_first=True).as_matrix()
-    pose[:3, 3] = [float(values[f"{name}_{axis}"][0]) for axis in "xyz"]
-    return pose

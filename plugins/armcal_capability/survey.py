@@ -1,9 +1,7 @@
 """An arm or designs of it as they are given, and areas cell by cell: whether the tool reaches them, turned how, held by
 the servos, and how far it sags there.
 
-Each cell's centre is searched for by damped Gauss-Newton from the nearest of many postures, in elastic equilibrium, all
-at once: the step by commands is J^T (J J^T + |e|^2 I)^-1 e over the joints that are free to move [Nakamura1986]. A tool
-that points too far away from where it should adds one equation, and none where it points well enough.
+Each cell's centre is searched for from the nearest of many postures (``armcal.calibration.inverse``).
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Angle, Force3, InputPath, Length, Length3, Mass, Settings, Torque
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.compensation.step import slopes, twists
+from armcal.calibration.inverse import Aim, Goal, Manner, Solver
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression, arm_expression
 from armcal.config.selection import with_values
 from armcal.config.system import System, build_system
@@ -46,10 +44,8 @@ MOST_IN_AREA = 500_000  # cells of an area: each is searched for
 _WORTH_COMPILING = 20_000
 """From this many postures on, waiting for the compiler costs less than CasADi's interpreter does."""
 _LENGTH = 0.1  # metres that a radian counts for, where a tool's place and direction are taken together
-_MOST_STEPS, _LONGEST = 60, 0.4  # of a search; rad or m in one step
-_ARRIVED_M = 1e-5
-_PROGRESS, _PATIENCE = 0.8, 6  # a search that comes no nearer than by this factor in so many steps is given up
-_DAMPING = 1e-9
+_ARRIVED = (1e-5, 5e-4)  # m, rad
+_MANNER = Manner(damping=1e-2, patience=12, steps=60)  # few starts a cell: each is followed for longer
 _INSIDE = 1e-3  # rad: how far inside the required cone the tool is brought
 _ROUND = 4  # starts at once, where one way to reach a cell is enough
 _LANES, _MM = 8, 1000.0
@@ -249,7 +245,6 @@ class Mechanics:
 
     positions: Array  # of the tool (3 x N; m, base frame)
     rotations: Array  # base_R_tool (3 x 3 x N)
-    slopes: Array  # of the tool by commands (N x 6 x n): metres, then rad about the axes of the base frame
     efforts: Array  # about or along the axes of all joints (joints x N; N m, N)
     states: Array  # deflections (n_d x N)
     settled: Mask  # whether there is an equilibrium (N)
@@ -268,24 +263,22 @@ class MechanicsFunction:
         self._equilibrium = Equilibrium(expression, choice)
         tool = expression.base_T_tool
         pose = ca.vertcat(ca.vec(tool.rotation), tool.translation)
-        by_commands = twists(replace(slopes(expression), corrected=pose))
-        outputs = [ca.densify(output) for output in (pose, ca.vec(by_commands), expression.efforts)]
+        outputs = [ca.densify(output) for output in (pose, expression.efforts)]
         function = ca.Function("capability", [expression.record, expression.state], outputs, {"cse": True})
         sample = [
-            self._records(np.linspace(-1, 1, _LANES) * np.ones((self._joints, 1))),
+            self.records(np.linspace(-1, 1, _LANES) * np.ones((self._joints, 1))),
             np.zeros((expression.state.numel(), _LANES)),
         ]
         self._function = BatchFunction(function, sample, choice)
 
     def __call__(self, commands: Array, states: Array | None = None) -> Mechanics:
         """``states`` are where the search for an equilibrium begins."""
-        record, count = self._records(commands), commands.shape[1]
+        record, count = self.records(commands), commands.shape[1]
         standing = self._equilibrium(record, states)
-        pose, by_commands, efforts = self._function(record, standing.states)
+        pose, efforts = self._function(record, standing.states)
         return Mechanics(
             positions=pose[9:],
             rotations=pose[:9].reshape(3, 3, count).swapaxes(0, 1),
-            slopes=by_commands.reshape(self._joints, 6, count).transpose(2, 1, 0),
             efforts=efforts,
             states=standing.states,
             settled=np.asarray(standing.settled, dtype=bool),
@@ -293,16 +286,17 @@ class MechanicsFunction:
 
     def tools(self, commands: Array) -> tuple[Array, Mask]:
         """Tools (N x 4 x 4), and which have an equilibrium."""
-        standing = self._equilibrium(self._records(commands))
+        standing = self._equilibrium(self.records(commands))
         return standing.base_T_tool, np.asarray(standing.settled, dtype=bool)
 
     def place(self, commands: Array, idle: tuple[str, ...], states: Array | None = None) -> Array:
         """Where the tool is if nothing acts through some channels of the load (3 x N; m)."""
-        record = self._records(commands)
+        record = self.records(commands)
         record[[self._channels.index(channel) for channel in idle]] = 0.0
         return np.asarray(self._equilibrium(record, states).base_T_tool[:, :3, 3].T)
 
-    def _records(self, commands: Array) -> Array:
+    def records(self, commands: Array) -> Array:
+        """Records (channels x N) of commands (n x N) under the load."""
         record = np.repeat(self._record[:, None], commands.shape[1], axis=1)
         record[: self._joints] = commands
         return record
@@ -413,6 +407,7 @@ class AreaSearch:
             raise ConfigError(f"holding: {fault}.")
         self._holding = np.array([settings.holding.get(name, np.inf) for name in names])
         self.function = MechanicsFunction(design.expression, settings.loads, choice)
+        self.solvers = solvers_of(design, choice)
         commands = spread(design.limits, settings.samples, settings.seed)
         commands = commands[:, self._allowed(commands)]
         self.clear = commands.shape[1]
@@ -474,7 +469,7 @@ class AreaSearch:
         """Commands (n x found) that bring the tool to centres from some of ``starts`` (cells x k), and their cells."""
         cell = np.repeat(np.arange(len(centres)), starts.shape[1])
         commands = np.asarray(self._commands[:, starts.reshape(-1)])
-        commands, arrived = reach_for(self.function, centres[cell].T, commands, self._design.limits, pointing)
+        commands, arrived = reach_for(self.solvers, self.function.records(commands), centres[cell].T, pointing)
         good = np.flatnonzero(arrived)
         good = good[self._allowed(commands[:, good])] if len(good) else good
         return cell[good], commands[:, good]
@@ -485,50 +480,24 @@ class AreaSearch:
         return self._design.clearance(commands).allowed
 
 
-def reach_for(
-    function: MechanicsFunction, targets: Array, starts: Array, limits: Array, pointing: Pointing | None = None
-) -> tuple[Array, Mask]:
-    """Commands within limits (n x 2) that bring the tool to targets (3 x N; m) from starts (n x N); which arrive."""
-    commands, arrived = starts.copy(), np.zeros(starts.shape[1], dtype=bool)
-    remaining, states = np.arange(starts.shape[1]), None
-    nearest, stalled = np.full(starts.shape[1], np.inf), np.zeros(starts.shape[1], dtype=int)
-    for _ in range(_MOST_STEPS):
-        mechanics = function(commands[:, remaining], states)
-        error, slope = _equations(mechanics, targets[:, remaining], pointing)
-        away = np.linalg.norm(error, axis=1)
-        there = mechanics.settled & (away < _ARRIVED_M)
-        arrived[remaining[there]] = True
-        stalled[remaining] = np.where(away < _PROGRESS * nearest[remaining], 0, stalled[remaining] + 1)
-        nearest[remaining] = np.minimum(nearest[remaining], away)
-        going = mechanics.settled & ~there & (stalled[remaining] < _PATIENCE)
-        remaining, error, slope, states = remaining[going], error[going], slope[going], mechanics.states[:, going]
-        if not len(remaining):
-            break
-        here = commands[:, remaining]
-        pull = np.einsum("nmj,nm->jn", slope, error)
-        stuck = ((here <= limits[:, :1]) & (pull < 0)) | ((here >= limits[:, 1:]) & (pull > 0))
-        free = slope * ~stuck.T[:, None, :]
-        damping = np.sum(error**2, axis=1) + _DAMPING
-        square = free @ np.swapaxes(free, 1, 2) + damping[:, None, None] * np.eye(error.shape[1])
-        step = np.einsum("nmj,nm->jn", free, np.linalg.solve(square, error[..., None])[..., 0])
-        step *= _LONGEST / np.maximum(np.abs(step).max(axis=0, initial=0.0), _LONGEST)
-        commands[:, remaining] = np.clip(here + step, limits[:, :1], limits[:, 1:])
-    return commands, arrived
+Solvers = Mapping[bool, Solver]  # for positions; and (True) with a direction of the tool
 
 
-def _equations(mechanics: Mechanics, targets: Array, pointing: Pointing | None) -> tuple[Array, Array]:
-    """What is missing (N x m; m) and its slope by commands (N x m x n)."""
-    error, slope = (targets - mechanics.positions).T, mechanics.slopes[:, :3]
-    if pointing is None:
-        return error, slope
-    axis = mechanics.rotations[:, pointing.axis].T
-    away = pointing.angles(mechanics.rotations) - max(pointing.within - _INSIDE, 0.0)
-    about = np.cross(axis, pointing.along)
-    size = np.linalg.norm(about, axis=1, keepdims=True)
-    about = np.where(size > 1e-9, about / np.maximum(size, 1e-9), np.roll(axis, 1, axis=1))
-    weight = (away > 0).astype(float) * _LENGTH
-    turn = np.einsum("ni,nij->nj", about, mechanics.slopes[:, 3:]) * weight[:, None]
-    return np.column_stack([error, away * weight]), np.concatenate([slope, turn[:, None]], axis=1)
+def solvers_of(design: Design, choice: EvaluatorChoice) -> Solvers:
+    aims: dict[bool, Aim] = {False: "position", True: "direction"}
+    parts = (_LENGTH, _ARRIVED, choice)
+    return {turns: Solver(design.expression, design.limits, aim, *parts) for turns, aim in aims.items()}
+
+
+def reach_for(solvers: Solvers, records: Array, targets: Array, pointing: Pointing | None = None) -> tuple[Array, Mask]:
+    """Commands within limits that bring the tool to targets (3 x N; m) from those of records; which arrive."""
+    if pointing is not None:
+        inside = max(pointing.within - _INSIDE, 0.0)
+        stated = np.concatenate([pointing.along, np.eye(3)[pointing.axis], [inside]])
+        targets = np.concatenate([targets, np.repeat(stated[:, None], targets.shape[1], axis=1)])
+    solver = solvers[pointing is not None]
+    solutions = solver(Goal(records, np.zeros((solver.states, targets.shape[1])), targets), _MANNER)
+    return solutions.commands, solutions.there
 
 
 def _require(holds: bool, message: str, hint: str) -> None:

@@ -11,7 +11,7 @@ from armcal.base.arrays import Array
 from armcal.base.config_text import as_line
 from armcal.base.quaternions import quaternion_of
 from armcal.base.units import to_unit
-from armcal.calibration.compensation.request import Commands, Targets
+from armcal.calibration.compensation import Commands, Targets
 from armcal.errors import ArmcalError, DataError, Location
 from armcal.io.json_server import SLICE_S
 

@@ -4,11 +4,10 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 from armcal.base.config_text import as_line
-from armcal.calibration.compensation.request import Redundancy
 from armcal.calibration.measured_point import Point
 from armcal.cli.common import Console, accept, point, speaking, within
 from armcal.functions.batch_function import EvaluatorChoice
@@ -25,13 +24,6 @@ _ALWAYS = ("refused", "missing", "notice")  # Events that are written with --qui
 @click.option("--socket", "path", type=click.Path(path_type=Path), help="Answer at this Unix socket.")
 @within
 @click.option(
-    "--redundancy",
-    type=click.Choice(get_args(Redundancy)),
-    default="nearest",
-    show_default=True,
-    help="Which of many commands.",
-)
-@click.option(
     "--evaluator",
     type=click.Choice(["compiled", "interpreted"]),
     default="compiled",
@@ -46,7 +38,6 @@ def serve(
     calibration: Path,
     path: Path | None,
     within: Path | None,
-    redundancy: Redundancy,
     evaluator: EvaluatorChoice,
     point: Point | None,
     accept: bool,
@@ -55,7 +46,7 @@ def serve(
 
     By default they come by standard input and answers go to standard output. The file may be replaced at any time.
     """
-    loader = Loader(str(calibration), redundancy, str(within or ""), point or "tool", evaluator, accept)
+    loader = Loader(str(calibration), str(within or ""), point or "tool", evaluator, accept)
     Server(loader, _notifier(console)).run(path)
 
 

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Options, Redundancy
+from armcal.calibration.compensation import Compensator, Options
 from armcal.calibration.measured_point import Point
 from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.config.yaml_source import MAX_BYTES
@@ -51,7 +50,6 @@ class Loader:
     """
 
     shown: str  # the file, as it is called in messages
-    redundancy: Redundancy = "nearest"  # which of many commands
     within: str = ""  # a configuration whose plan has limits and clearance; empty: none
     point: Point = "tool"  # what forward and compensate are about: the tool's frame, or the target that was measured
     evaluator: EvaluatorChoice = "compiled"  # ``compiled`` where a compiler is found, or ``interpreted``
@@ -127,7 +125,7 @@ class Loader:
             self._spaces[name] = workspace_of(Path(self.within), joints, discover())
         space = self._spaces.get(name)
         limits, allowed = (space.limits, space.allowed) if space else ({}, None)
-        options, like = Options(limits=limits, redundancy=self.redundancy), before.expression if before else None
+        options, like = Options(limits=limits), before.expression if before else None
         expression = calibration.expression(name, conditions, self.point, calibration.free, like)
         try:
             return Compensator(expression, calibration.parameters, options, allowed, self.evaluator)

@@ -11,8 +11,7 @@ from armcal.base.arrays import Array
 from armcal.base.poses import PoseSettings
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import from_unit, split_suffix, to_unit
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Targets
+from armcal.calibration.compensation import Compensator, Targets
 from armcal.calibration.measured_point import Point
 from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
 from armcal.errors import DataError, Location

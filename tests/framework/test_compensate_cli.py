@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.nominal import sent
-from armcal.calibration.compensation.request import Options
+from armcal.calibration.compensation import Compensator, Options, sent
 from armcal.cli.main import cli
 from armcal.plugins import discover
 from armcal.run import compensate as run_compensate
@@ -219,7 +217,7 @@ def test_what_a_controller_of_the_nominal_arm_is_sent(desk: Desk) -> None:
     shifts = np.array([[float(row[f"d{axis}_mm"]) for axis in "xyz"] for row in rows])
     assert sent - shifts == pytest.approx(desk.places_mm, abs=1e-9)
     assert np.abs(shifts).max() > 0.5
-    nominal = Bench.of(Calibration.load(desk.calibration), None, None, "nearest", discover()).nominal()
+    nominal = Bench.of(Calibration.load(desk.calibration), None, None, discover()).nominal()
     for place, start in zip(sent / 1000, commands, strict=True):
 
         def off(q: np.ndarray, place=place) -> np.ndarray:
@@ -337,7 +335,6 @@ def test_paths_that_lead_nowhere(desk: Desk) -> None:
         (["--within", str(CONFIGS / "lrm_arm" / "arm.yaml")], "found no plan"),
         (["--within", str(CONFIGS / "lrm_arm" / "plan.yaml")], "those of the calibration q1, q2, q3"),
         (["--within", "none.yaml"], "there is no such file"),
-        (["--redundancy", "quickest"], "quickest"),
     ],
 )
 def test_options_that_do_not_fit(desk: Desk, option: list[str], said: str) -> None:
@@ -365,7 +362,7 @@ def test_limits_of_the_plan_are_kept(tmp_path: Path) -> None:
     given = made_calibration(CONFIGS / "lrm_arm" / "arm.yaml")
     desk = tmp_path / "c.yaml"
     written(given, desk)
-    bench = Bench.of(Calibration.load(desk), None, CONFIGS / "lrm_arm" / "plan.yaml", "nearest", discover())
+    bench = Bench.of(Calibration.load(desk), None, CONFIGS / "lrm_arm" / "plan.yaml", discover())
     assert bench.options.limits["q2"] == pytest.approx((-np.radians(50), np.radians(50)))
     assert bench.space.allowed is not None
     found = bench.compensator()
@@ -407,7 +404,7 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compensator, C
     """The LRM arm's calibration as a file, the arm as it is, and what its controller takes it for."""
     given = made_calibration(CONFIGS / "lrm_arm" / "arm.yaml")
     path = written(given, tmp_path_factory.mktemp("table") / "calibration.yaml")
-    nominal = Bench.of(Calibration.load(path), None, None, "nearest", discover()).nominal()
+    nominal = Bench.of(Calibration.load(path), None, None, discover()).nominal()
     return path, given.compensator(options=Options(), choice="interpreted"), nominal
 
 
@@ -477,7 +474,7 @@ def test_assessing_needs_no_prediction_of_errors() -> None:
     """A calibration that keeps nothing of its errors gives no radii, and says nothing of them."""
     found = compensator("three")
     targets = found.targets(found.forward(drawn(found, 3))[:, :3, 3])
-    bench = Bench.of(calibration("three"), None, None, "nearest", discover())
+    bench = Bench.of(calibration("three"), None, None, discover())
     assessed = run_compensate.assess(bench, found, targets, found.solve(targets))
     assert assessed.radii is None
     assert run_compensate.summary(assessed)["radius_95_mm"] is None

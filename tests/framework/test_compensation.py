@@ -1,4 +1,4 @@
-"""Commands for targets: exact where they can be reached, else nearest, as redundancy asks, on paths, and in counts."""
+"""Commands for targets: exact where they can be reached, else nearest, on paths, and in counts."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ from itertools import product
 import numpy as np
 import pytest
 from armcal.arm.servo import quantised
-from armcal.calibration.compensation.compensator import SEEDS, Compensator
-from armcal.calibration.compensation.finder import Seeds, Solutions
-from armcal.calibration.compensation.path import with_sides
-from armcal.calibration.compensation.request import Commands, Options, Targets
+from armcal.calibration.compensation import SEEDS, Commands, Compensator, Options, Targets, with_sides
+from armcal.calibration.inverse import Seeds, Solutions
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import Equilibrium
 from armcal.functions.compiler import find_compiler
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
-from small_arms import LRM_LIMITS, calibration, compensator, drawn, predicted, with_options
+from small_arms import LRM_LIMITS, calibration, compensator, drawn, exact, predicted, with_options
 
 NEAR_M, NEAR_RAD = 1e-9, 1e-8
 NARROW = {f"q{i}": (-1.2, 1.2) for i in range(1, 6)}
@@ -300,10 +298,10 @@ def test_clearance_that_forbids_everything_says_so(name: str) -> None:
 
 def test_counts_that_stand_too_near_are_not_had() -> None:
     """Exact commands are allowed, all counts about them are not."""
-    exact = np.array([0.3, 0.8, -0.9])
-    found = with_options("servos", Options(), allowed=lambda q: np.abs(q - exact[:, None]).max(axis=0) < 1e-5)
-    target = compensator("servos").exact(exact[None], acting(found, 1))[:, :3, 3]
-    commands = found.solve(found.targets(target), exact)
+    at = np.array([0.3, 0.8, -0.9])
+    found = with_options("servos", Options(), allowed=lambda q: np.abs(q - at[:, None]).max(axis=0) < 1e-5)
+    target = exact(compensator("servos"), at[None], acting(found, 1))[:, :3, 3]
+    commands = found.solve(found.targets(target), at)
     assert not commands.reached[0]
     assert commands.reasons[0] == "all commands found that reach it are too near to something"
 
@@ -349,52 +347,6 @@ def test_the_nearest_commands_cannot_be_bettered(count: int) -> None:
         mine = cost(commands.joint_angles[i])
         starts = np.concatenate([commands.joint_angles[i : i + 1], elsewhere])
         assert mine <= 1.001 * improved(found, cost, targets.positions[i], starts)
-
-
-def test_a_redundancy_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="found the redundancy 'quickest', expected one of nearest, stiffest"):
-        Options(redundancy="quickest")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("redundancy", ["stiffest", "least_sag", "coolest"])
-@pytest.mark.quick("least_sag")
-def test_what_redundancy_makes_small_cannot_be_made_much_smaller(redundancy: str) -> None:
-    found = with_options("five", Options(limits=NARROW, redundancy=redundancy))
-    targets = of(found, drawn(found, 2, seed=3))
-    commands = found.solve(targets)
-    assert commands.reached.all()
-    assert commands.distances.max() <= NEAR_M
-    assert within(found, commands)
-    ordinary = with_options("five", Options(limits=NARROW)).solve(targets)
-    others = drawn(found, 1, seed=5)
-    for i in range(2):
-
-        def cost(q: np.ndarray) -> float:
-            return wanted(found, redundancy, q)
-
-        mine = cost(commands.joint_angles[i])
-        assert mine <= cost(ordinary.joint_angles[i]) * (1 + 1e-6)
-        starts = np.stack([commands.joint_angles[i], *others])
-        assert mine <= 1.02 * improved(found, cost, targets.positions[i], starts)
-
-
-def wanted(found: Compensator, redundancy: str, q: np.ndarray) -> float:
-    """What is to be small, from the arm's tools alone."""
-    if redundancy == "stiffest":
-        load, moved = acting(found, 6), np.repeat(q[None], 6, axis=0)
-        for axis in range(3):
-            load[7 + axis, 2 * axis] += 0.05
-            load[7 + axis, 2 * axis + 1] -= 0.05
-        tips = found.forward(moved, load)[:, :3, 3]
-        return float(((tips[::2] - tips[1::2]) ** 2).sum() / 0.01)
-    if redundancy == "least_sag":
-        light = acting(found, 1)
-        light[:3] = 0
-        return float(((found.forward(q)[:, :3, 3] - found.forward(q, light)[:, :3, 3]) ** 2).sum())
-    # The only weights hang beyond the last joint, 80 g at the tool: torques are what lifts it.
-    step = 1e-6 * np.eye(5)
-    heights = (found.forward(q + step)[:, 2, 3] - found.forward(q - step)[:, 2, 3]) / 2e-6
-    return float((heights**2).sum())
 
 
 # -- paths ---------------------------------------------------------------------------------------------------------
@@ -546,7 +498,7 @@ def test_no_counts_nearby_are_better(name: str) -> None:
     """All of two to either side, tried on the arm; the linear choice may miss by little."""
     found = compensator(name)
     where = drawn(found, 12, seed=8)
-    positions = found.exact(where, acting(found, 12))[:, :3, 3]
+    positions = exact(found, where, acting(found, 12))[:, :3, 3]
     commands = found.solve(found.targets(positions))
     servos = [found.expression.servos.get(joint) for joint in found.joints]
     for i in range(12):
@@ -558,7 +510,7 @@ def test_no_counts_nearby_are_better(name: str) -> None:
                 if servo:
                     q[joint] = float(servo[0].angle((commands.counts[i, joint] + step) * servo[1].tick))
             tried.append(q)
-        tools = found.exact(np.array(tried), acting(found, len(tried)))
+        tools = exact(found, np.array(tried), acting(found, len(tried)))
         best = np.linalg.norm(tools[:, :3, 3] - positions[i], axis=1).min()
         assert commands.distances[i] <= 1.05 * best + 1e-7
 
@@ -566,7 +518,7 @@ def test_no_counts_nearby_are_better(name: str) -> None:
 def test_the_best_counts_are_better_than_the_nearest_ones() -> None:
     found = compensator("servos")
     where = drawn(found, 60, seed=4)
-    positions = found.exact(where, acting(found, 60))[:, :3, 3]
+    positions = exact(found, where, acting(found, 60))[:, :3, 3]
     rounded = found.forward(where)[:, :3, 3]
     commands = found.solve(found.targets(positions), where)
     nearest = np.linalg.norm(rounded - positions, axis=1)
@@ -592,7 +544,7 @@ def test_counts_stay_within_limits() -> None:
     found = with_options("servos", Options(limits=limits))
     start = np.array([0.2, 0.1, 0.7])
     edge = np.array([[0.4, 0.5, 0.7], [0.0, 1.0, 0.7], [0.2, -1.0, 0.7]])
-    commands = found.solve(found.targets(found.exact(edge, acting(found, 3))[:, :3, 3]), start)
+    commands = found.solve(found.targets(exact(found, edge, acting(found, 3))[:, :3, 3]), start)
     assert commands.reached.all()
     assert within(found, commands)
 

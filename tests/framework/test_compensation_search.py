@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal.calibration.compensation.search import NEAREST, PREFERRED, QUICK, Goal, Manner, Near, Search
-from armcal.calibration.compensation.step import slopes, step_function
+from armcal.calibration.inverse import NEAREST, PREFERRED, QUICK, Goal, Manner, Near, Search, slopes, step_function
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
 from small_arms import compensator, drawn
@@ -31,7 +30,7 @@ class Pair:
 
     def search(self, choice: EvaluatorChoice) -> Search:
         expression = self.found.expression
-        return Search(expression, self.limits, self.turns, LENGTH, choice)
+        return Search(expression, self.limits, "pose" if self.turns else "position", LENGTH, choice)
 
     def goal(self, count: int, stretch: float = 1.0) -> Goal:
         """Targets of random commands (farther out where they are stretched), from other random commands."""
@@ -166,7 +165,7 @@ def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     record, free = goal.record.copy(), np.ones((6, 1000))
     record[:6] = found.commands
     expression = pair.found.expression
-    step = step_function(expression, slopes(expression), True).map(1000)
+    step = step_function(expression, slopes(expression), "pose").map(1000)
     answers = step(record, goal.target, 0 * free, free, free[:1], LENGTH * free[:1], found.states)
     _, left, _, error, _ = (each.full()[:, found.there] for each in answers)
     assert np.linalg.norm(error[:3], axis=0).max() <= near.metres

@@ -99,9 +99,9 @@ def test_commands_for_a_tool_beside_a_fitted_target_state_no_radius(tmp_path: Pa
     )
     fitted = replace(known, record=known.record.model_copy(update={"parameters": entries}))
     assert "tracker.target_z" in fitted.free
-    open_ones = [Bench.of(fitted, None, None, "nearest", discover(), point).is_judged for point in ("tool", "target")]
+    open_ones = [Bench.of(fitted, None, None, discover(), point).is_judged for point in ("tool", "target")]
     assert open_ones == [False, True]
-    assert Bench.of(known, None, None, "nearest", discover()).is_judged
+    assert Bench.of(known, None, None, discover()).is_judged
     path = written(fitted, tmp_path / "fitted.yaml")
     asked = ("compensate", path, "--targets", tmp_path / "shown.csv", "--out", tmp_path / "commands.csv", "--point")
     assert "tool frame's origin is off is not known" in armcal(*asked, "tool").output
@@ -187,7 +187,7 @@ def test_a_controller_of_the_nominal_arm_can_be_sent_poses_of_the_measured_targe
     assert json.loads(ran.stdout)["point"] == "target" and "the tool frame's origin" not in ran.stderr
     places, shifts = rows(out, "x_mm y_mm z_mm"), rows(out, "dx_mm dy_mm dz_mm")
     assert places - shifts == pytest.approx(nodes, abs=1e-9)
-    bench = Bench.of(lrm, None, None, "nearest", discover(), "target")
+    bench = Bench.of(lrm, None, None, discover(), "target")
     real, nominal = bench.compensator(), bench.nominal()
     turned = np.repeat(Rotation.from_euler("xyz", [0, 90, 0], degrees=True).as_matrix()[None], len(nodes), axis=0)
     given = real.targets(nodes / 1000, turned, payload=0.0)

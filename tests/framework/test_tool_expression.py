@@ -8,9 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from armcal.arm.statics import LOAD_CHANNELS
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Options
-from armcal.calibration.compensation.step import slope_function
+from armcal.calibration.compensation import Compensator, Options
+from armcal.calibration.inverse import slope_function
 from armcal.errors import NotConvergedError
 from made_calibrations import made_calibration
 from scipy.spatial.transform import Rotation

@@ -32,7 +32,6 @@ class Dataset:
         sha256: of the source's bytes; empty if there were none.
         set_aside: records left out on reading.
         warnings: what a user should know before trusting the data.
-        files: paths of what was measured in each record, by measurement: a camera's images.
     """
 
     ids: tuple[str, ...]
@@ -43,7 +42,6 @@ class Dataset:
     sha256: str = ""
     set_aside: tuple[SetAside, ...] = ()
     warnings: tuple[str, ...] = ()
-    files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
     def of_rows(cls, channels: Sequence[str], rows: Sequence[Sequence[float]], source: str) -> Self:
@@ -94,7 +92,6 @@ class Dataset:
             channels={name: values[index] for name, values in self.channels.items()},
             extra={name: tuple(values[i] for i in index) for name, values in self.extra.items()},
             rows=tuple(self.rows[i] for i in index) if self.rows else (),
-            files={name: tuple(paths[i] for i in index) for name, paths in self.files.items()},
         )
 
     def without(self, faulty: Mapping[int, str]) -> Self:

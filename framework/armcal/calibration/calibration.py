@@ -14,8 +14,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import identity
 from armcal.calibration.calibration_file import CalibrationFile, identity_of, lost_calibration, read_record
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Commands, Options
+from armcal.calibration.compensation import Commands, Compensator, Options
 from armcal.calibration.intervals import PlusMinus, Uncertainty
 from armcal.calibration.measured_point import Point, tool_point
 from armcal.calibration.physics import (
@@ -34,7 +33,6 @@ from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location, NotConvergedError
-from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover
@@ -252,23 +250,16 @@ class Calibration:
             components,
         )
 
-    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
+    def plus_minus(self, commands: Dataset) -> PlusMinus:
         """How far measurements at these commands may lie from ``predict``.
 
-        In the ``same`` recording as the calibration's, with the drift that it determines, which ``shift`` adds to the
-        predicted channels.
+        Where something drifts, in another recording than the calibration's.
 
         Raises:
-            ConfigError: the calibration does not say, or was recalibrated since.
-            DataError: in the same recording, and the records do not say their place in it.
+            ConfigError: the calibration does not say.
             NotConvergedError: a record has no equilibrium.
         """
-        if recording == "same" and self.record.recalibrated is not None:
-            raise ConfigError(
-                "the calibration was updated after its recording, so the drift of that recording is not known.",
-                hint="Predict for a new recording.",
-            )
-        return self.uncertainty.plus_minus(commands, recording)
+        return self.uncertainty.plus_minus(commands)
 
     def expression(
         self,

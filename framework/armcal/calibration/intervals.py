@@ -1,19 +1,15 @@
-"""How far a calibrated arm may be off its predictions: what a calibration keeps for that, and its use.
-
-A drift is not kept as its states: with their covariance, and with how both hang on every parameter, they are many
-times larger than the records that tell of it. Those are kept instead, and the drift is told again from them, exactly.
-"""
+"""How far a calibrated arm may be off its predictions: what a calibration keeps for that, and its use."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
@@ -24,42 +20,20 @@ from armcal.calibration.tool_expression import APPROACH
 from armcal.config.system import System
 from armcal.diagnose.coverage import Stretch, level_name
 from armcal.errors import DataError
-from armcal.estimate.prediction import (
-    POSITION,
-    STATED,
-    TURN,
-    KnownDrift,
-    Predictor,
-    Spread,
-    is_position,
-)
+from armcal.estimate.prediction import POSITION, STATED, TURN, Predictor, Spread, is_position
 from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.io.plain_files import input_file
 from armcal.measure.reader import RequestedChannel
 from armcal.problem.problem import Problem
-from armcal.problem.variants import Chain, chain, reading_slopes, sizes_of, unexplained, with_drift, with_joint_noise
+from armcal.problem.variants import reading_slopes, sizes_of, unexplained, with_joint_noise
 
 _AT_ONCE = 1000  # Records whose slopes are in memory together
-_FORGOTTEN = 5.0  # So many correlation distances beyond the recording nothing is known of its drift
 _DIGITS = 12
 
 
-class RecordingRecord(Settings):
-    """The records that tell of a drift (SI, a row a record), and their weights (a row a measurement; none for ones)."""
-
-    drifts: dict[str, Drift]
-    channels: tuple[str, ...]
-    records: tuple[tuple[float, ...], ...]
-    weights: tuple[tuple[float, ...], ...] = ()
-
-    @property
-    def dataset(self) -> Dataset:
-        return Dataset.of_rows(self.channels, self.records, "the recording that the calibration keeps")
-
-
 class PredictionRecord(Settings):
-    """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, a recording.
+    """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, what drifts.
 
     ``columns`` are what the calibration's data called its columns; ``ranges`` those of joints and payload in its
     records (SI; see ``recorded_range``).
@@ -69,7 +43,7 @@ class PredictionRecord(Settings):
     covariance: tuple[tuple[float, ...], ...]
     stretches: dict[Literal["same", "new"], Stretch] = Field(default_factory=dict)
     columns: dict[str, str] = Field(default_factory=dict)
-    recording: RecordingRecord | None = None
+    drifts: dict[str, Drift] = Field(default_factory=dict)
     ranges: dict[str, tuple[float, float]] = Field(default_factory=dict)
 
     def columns_in(self, path: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
@@ -87,6 +61,15 @@ class PredictionRecord(Settings):
             if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
         }
 
+    @model_validator(mode="before")
+    @classmethod
+    def _as_before(cls, record: Any) -> Any:
+        """Earlier versions kept the records that tell of a drift."""
+        if isinstance(record, dict) and "recording" in record:
+            before = record["recording"] or {}
+            record = {**{k: v for k, v in record.items() if k != "recording"}, "drifts": before.get("drifts", {})}
+        return record
+
     @property
     def symmetric_covariance(self) -> Array:
         lower = np.zeros((len(self.covariance), len(self.covariance)))
@@ -100,7 +83,6 @@ class PlusMinus:
     """How far measurements may lie from predictions.
 
     Attributes:
-        shift: what the drift of the recording adds to each predicted channel (N each; zero in a new recording).
         deviations: standard deviation of each channel (N each; SI), not stretched; none of a measurement whose residual
             does not follow from its readings.
         radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
@@ -109,7 +91,6 @@ class PlusMinus:
         unknown: how little learned pose residuals know of each pose (N; m, standard deviation); None without any.
     """
 
-    shift: dict[str, Array]
     deviations: dict[str, Array]
     half_widths: dict[str, Array]  # of 90 % intervals, stretched as cross-validation found (N each)
     radii: dict[str, Array]
@@ -120,21 +101,6 @@ class PlusMinus:
 
 def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(f"{x:.{_DIGITS}g}") for x in row[: i + 1]) for i, row in enumerate(covariance))
-
-
-def recording_record(problem: Problem, dataset: Dataset) -> RecordingRecord | None:
-    """The training records (a dataset in the order of those of the fitted problem); None where nothing drifts."""
-    drifts = {b.name: b.drift for b in problem.parameters.free if b.drift is not None}
-    if not drifts:
-        return None
-    weights = [factor_records.weight[: factor_records.count] for factor_records in problem.records]
-    weighed = any(np.any(weight != 1) for weight in weights)
-    return RecordingRecord(
-        drifts=drifts,
-        channels=tuple(dataset.channels),
-        records=tuple(tuple(row) for row in dataset.stacked(tuple(dataset.channels)).T.tolist()),
-        weights=tuple(tuple(w.tolist()) for w in weights) if weighed else (),
-    )
 
 
 @dataclass(frozen=True)
@@ -149,38 +115,29 @@ class Uncertainty:
     freedom: float  # degrees of freedom
     components: tuple[Component, ...] = ()  # estimated variances, if there were any
 
-    def plus_minus(self, commands: Dataset, recording: Recording = "new") -> PlusMinus:
-        """How far measurements at these commands may lie from predictions.
+    def plus_minus(self, commands: Dataset) -> PlusMinus:
+        """How far measurements at these commands may lie from predictions, in a recording of its own.
 
         Args:
-            commands: records with joint angles, load, gravity; in the same recording with their place in it.
-            recording: ``same`` as the calibration's, whose drift is told as far as records lie near; or a ``new`` one.
+            commands: records with joint angles, load, gravity.
 
         Raises:
-            DataError: in the same recording, and the records do not say their place in it.
             NotConvergedError: a record has no equilibrium.
         """
-        recording_record = self.record.recording
         problem, commands = self._with_predictions(commands)
-        near = np.zeros(len(commands), dtype=bool)
-        if recording == "same" and recording_record is not None:
-            near = self._near(recording_record, commands)
-        parts = [self._apart(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.flatnonzero(~near))]
-        if recording_record is not None and near.any():
-            recorded = recording_record.dataset
-            along = chain(problem, recorded, commands.subset(np.flatnonzero(near)))
-            drift = self._known_drift(recording_record, recorded, along)
-            for chunk in _chunks(np.flatnonzero(near)):
-                parts.append(self._within(problem, commands.subset(chunk), chunk, drift, along))
-        plus_minus = _joined(problem, parts, len(commands), self.record.stretches)
+        parts = [self._part(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.arange(len(commands)))]
+        plus_minus = _joined(problem, parts, len(commands), self.record.stretches.get(self._recording))
         if not any(arm.residual and arm.residual.is_learned for arm in self.system.arms.values()):
             return plus_minus
-        chunks = [problem.of(commands.subset(chunk)) for chunk in _chunks(np.arange(len(commands)))]
-        unknown = [sizes_of(unexplained(chunk, self.values)) for chunk in chunks]
+        unknown = [sizes_of(unexplained(problem.of(commands.subset(part.places)), self.values)) for part in parts]
         return replace(plus_minus, unknown=np.concatenate([np.zeros(0), *unknown]))
 
-    def _apart(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
-        """Where nothing is told of a drift."""
+    @property
+    def _recording(self) -> Recording:
+        """In which recordings alike the calibration's its intervals hold: where something drifts, in a new one."""
+        return "new" if self.record.drifts else "same"
+
+    def _part(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         problem = with_joint_noise(problem.of(commands), self.values, self.noise_scale)
         whitened = problem
         if self.components:  # with the noise that the calibration estimated
@@ -188,20 +145,9 @@ class Uncertainty:
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
             whitened = apply_components(problem, self.values, estimated, axes)
-        spreads = self._from_either_side(problem, self._predictor(None).spreads(whitened, "new"), commands)
-        recording: Recording = "same" if self.record.recording is None else "new"
-        still = tuple(np.zeros_like(spread.deviations) for spread in spreads)
-        return _Part(places, recording, still, spreads, reading_slopes(problem, self.values))
-
-    def _within(
-        self, problem: Problem, commands: Dataset, places: Indices, drift: KnownDrift, along: Chain | None
-    ) -> _Part:
-        problem = self._drifted(problem.of(commands), commands, along, self.noise_scale)
-        spreads = self._from_either_side(problem, self._predictor(drift).spreads(problem, "same"), commands)
-        shared = problem.correlation
-        moved = () if shared is None else [shared.shift(i, drift.states) for i in range(len(problem.records))]
-        off = tuple(m[:, : len(places), 0] for m in moved)
-        return _Part(places, "same", off, spreads, reading_slopes(problem, self.values))
+        by = Predictor(self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom)
+        spreads = self._from_either_side(problem, by.spreads(whitened, "new"), commands)
+        return _Part(places, spreads, reading_slopes(problem, self.values))
 
     def _from_either_side(self, problem: Problem, spreads: Sequence[Spread], commands: Dataset) -> tuple[Spread, ...]:
         """With half of what the side makes that a joint came from, squared, where that side is not known (0)."""
@@ -219,23 +165,6 @@ class Uncertainty:
                 covariance += np.einsum("rn,sn->nrs", half, half)
         return tuple(replace(s, covariance=own) for s, own in zip(spreads, covariances, strict=True))
 
-    def _predictor(self, drift: KnownDrift | None) -> Predictor:
-        return Predictor(self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom, drift)
-
-    def _known_drift(self, recording: RecordingRecord, dataset: Dataset, along: Chain | None) -> KnownDrift:
-        problem = self._drifted(self._problem(dataset), dataset, along)
-        if recording.weights:
-            problem = problem.weighted([np.array(row) for row in recording.weights])
-        known_drift = KnownDrift.by(problem, self.values)
-        if known_drift is None:
-            raise TypeError("a recording is kept only where something drifts")
-        return known_drift
-
-    def _drifted(self, problem: Problem, dataset: Dataset, along: Chain | None, noise_scale: float = 1.0) -> Problem:
-        """The problem of a dataset with the noise of joints, and with what drifts."""
-        noisy = with_joint_noise(problem, self.values, noise_scale)
-        return with_drift(noisy, dataset, self.parameters.nominal(), along)
-
     def _with_predictions(self, commands: Dataset) -> tuple[Problem, Dataset]:
         """The commands with what instruments read there: residuals may depend on readings in any way."""
         names = [f"{name}.{c.name}" for name, m in self.system.measurements.items() for c in m.channels()]
@@ -247,43 +176,26 @@ class Uncertainty:
         return problem, replace(commands, channels={**unread, **commands.channels, **read})
 
     def _problem(self, dataset: Dataset) -> Problem:
-        system, recording = self.system, self.record.recording
-        drifts = {} if recording is None else recording.drifts
-        drifting = self.parameters.replaced({n: replace(self.parameters[n], drift=d) for n, d in drifts.items()})
+        drifts = self.record.drifts.items()
+        drifting = self.parameters.replaced({n: replace(self.parameters[n], drift=d) for n, d in drifts})
+        system = self.system
         parts = (system.arms, system.measurements, drifting, system.environment, dataset)
         return Problem.build(*parts, "interpreted", groups={})
-
-    def _near(self, recording: RecordingRecord, commands: Dataset) -> Array:
-        """Whether the recording says anything of each record's drift (N)."""
-        near, recorded = np.ones(len(commands), dtype=bool), recording.dataset
-        for name, drift in recording.drifts.items():
-            if not commands.has(drift.channel):
-                raise DataError(
-                    f"{name} drifts over {drift.channel}, and the poses do not say theirs.",
-                    where=commands.where(),
-                    hint=f"Add a column {drift.channel}, name the one that is, or predict in a new recording.",
-                )
-            at, known = commands.column(drift.channel), recorded.column(drift.channel)
-            reach = _FORGOTTEN * drift.over
-            near &= (at > known.min() - reach) & (at < known.max() + reach)
-        return near
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Some records: their places, what is known of their drift, and by factor what that says of their residuals.
+    """Some records: their places, and by factor the spreads of their residuals.
 
-    Shifts (n_r x N) and spreads are of residuals, ``slopes`` (N x outputs x n_r) those of the readings by them.
+    ``slopes`` (N x outputs x n_r) are those of the readings by residuals.
     """
 
     places: Indices
-    recording: Recording
-    shifts: tuple[Array, ...]
     spreads: tuple[Spread, ...]
     slopes: tuple[Array | None, ...]
 
-    def of_readings(self, place: int) -> tuple[Array, Spread] | None:
-        """Shift (outputs x N) and spread of the readings of one factor; None where they do not follow from residuals.
+    def of_readings(self, place: int) -> Spread | None:
+        """The spread of the readings of one factor; None where they do not follow from residuals.
 
         A reading that no residual depends on is not known to any extent: not a number.
         """
@@ -293,31 +205,28 @@ class _Part:
         covariance = slope @ spread.covariance @ slope.transpose(0, 2, 1)
         idle = ~np.any(slope != 0, axis=2)
         covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
-        return np.einsum("nor,rn->on", slope, self.shifts[place]), Spread(covariance, spread.freedom)
+        return Spread(covariance, spread.freedom)
 
 
-def _joined(
-    problem: Problem, parts: Sequence[_Part], count: int, stretches: Mapping[Literal["same", "new"], Stretch]
-) -> PlusMinus:
-    plus_minus = PlusMinus({}, {}, {}, {})
+def _joined(problem: Problem, parts: Sequence[_Part], count: int, own: Stretch | None) -> PlusMinus:
+    plus_minus = PlusMinus({}, {}, {})
+    stretch = own.coordinates[level_name(STATED)] if own else 1.0
+    factor = own.radius if own and own.radius is not None else 1.0
     for place, kernel in enumerate(problem.kernels):
         channels, name = kernel.factor.output_channels, kernel.factor.name
-        known = [part.of_readings(place) for part in parts]
-        if not channels or any(own is None for own in known):
+        spreads = [part.of_readings(place) for part in parts]
+        if not channels or any(spread is None for spread in spreads):
             continue
-        rows, radius, turn = (np.full((*size, count), np.nan) for size in ((3, len(channels)), (), ()))
+        rows, radius, turn = (np.full((*size, count), np.nan) for size in ((2, len(channels)), (), ()))
         covariance = np.full((count, len(channels), len(channels)), np.nan)
-        for part, (shift, spread) in zip(parts, filter(None, known), strict=True):
-            own = stretches.get(part.recording)
-            stretch = own.coordinates[level_name(STATED)] if own else 1.0
-            rows[:, :, part.places] = shift, spread.deviations, stretch * spread.half_widths(STATED)
+        for part, spread in zip(parts, filter(None, spreads), strict=True):
+            rows[:, :, part.places] = spread.deviations, stretch * spread.half_widths(STATED)
             covariance[part.places] = stretch**2 * spread.covariance
             if is_position(kernel):
-                factor = own.radius if own and own.radius is not None else 1.0
                 radius[part.places] = spread.of(POSITION).radius() * factor
                 turn[part.places] = stretch * part.spreads[place].of(TURN).radius(STATED) if len(channels) > 3 else 0
         for i, channel in enumerate(channels):
-            plus_minus.shift[channel], plus_minus.deviations[channel], plus_minus.half_widths[channel] = rows[:, i]
+            plus_minus.deviations[channel], plus_minus.half_widths[channel] = rows[:, i]
         if is_position(kernel):
             plus_minus.radii[name], plus_minus.covariances[name] = radius, covariance[:, :3, :3]
         if is_position(kernel) and len(channels) > len(POSITION):

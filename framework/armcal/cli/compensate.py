@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import click
 import numpy as np
@@ -11,9 +11,7 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.units import parse_quantity
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.nominal import sent
-from armcal.calibration.compensation.request import Redundancy
+from armcal.calibration.compensation import Compensator, sent
 from armcal.calibration.recorded_range import beyond_records
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, within
 from armcal.errors import InputError, Location
@@ -34,13 +32,6 @@ _ARRIVES = {"tool": "by the tool frame's origin", "target": "by the measured tar
 @within
 @click.option("--path", "kind", flag_value="path", help="The targets are a path: one after another, without jumps.")
 @click.option("--start", multiple=True, metavar="JOINT=ANGLE", help="Where the arm comes from: --start 'q1=10 deg'.")
-@click.option(
-    "--redundancy",
-    type=click.Choice(get_args(Redundancy)),
-    default="nearest",
-    show_default=True,
-    help="Which of many commands.",
-)
 @point
 @click.option(
     "--for",
@@ -56,9 +47,7 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
     spare_inputs(out, calibration, targets, options["within"])
     registry = console.registry()
     loaded = Calibration.load(calibration, registry, options["accept"])
-    bench = Bench.of(
-        loaded, options["arm"], options["within"], options["redundancy"], registry, options["point"] or "tool"
-    )
+    bench = Bench.of(loaded, options["arm"], options["within"], registry, options["point"] or "tool")
     goals, given = bench.read(targets, registry)
     for text in given.warnings:
         console.warn(text)

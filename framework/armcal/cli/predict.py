@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import click
 import numpy as np
@@ -25,30 +24,22 @@ from armcal.run.compensate import short_texts
 
 _MOST_NAMED = 8
 _LAYOUT = "Name columns so, or as the calibration's data did, with commas between them and decimal points."
-_RECORDINGS: Mapping[str, Literal["same", "new"]] = {"calibrated": "same", "new": "new"}
 
 
 @click.command()
 @click.argument("calibration", type=FILE)
 @click.option("--poses", required=True, type=FILE, help="A CSV of commanded joint angles.")
 @click.option("--out", required=True, type=FILE, help="The CSV to write.")
-@click.option(
-    "--recording",
-    type=click.Choice(list(_RECORDINGS)),
-    default="new",
-    show_default=True,
-    help="Whether the poses belong to the calibration's recording, in which the drift of parameters is known.",
-)
 @accept
 @speaking
-def predict(console: Console, calibration: Path, poses: Path, out: Path, recording: str, accept: bool) -> None:
+def predict(console: Console, calibration: Path, poses: Path, out: Path, accept: bool) -> None:
     """Predict the tip of the arm in CALIBRATION for each row of commanded joint angles, and how far it may be off."""
     spare_inputs(out, calibration, poses)
     registry = console.registry()
     loaded = Calibration.load(calibration, registry, accept)
     system = loaded.system
     commands = read_commands(registry, loaded, poses)
-    _warn_of_missing(console, loaded, commands, recording)
+    _warn_of_missing(console, loaded, commands)
     channels, placed = loaded.predict(commands)
     plus_minus = None
     if not loaded.readable:
@@ -60,8 +51,7 @@ def predict(console: Console, calibration: Path, poses: Path, out: Path, recordi
     elif loaded.record.prediction is None:
         console.warn("the calibration keeps nothing about the errors of predictions: run it again to have them.")
     else:
-        plus_minus = loaded.plus_minus(commands, _RECORDINGS[recording])
-        channels = {name: values + plus_minus.shift.get(name, 0.0) for name, values in channels.items()}
+        plus_minus = loaded.plus_minus(commands)
         if unknown := [name for name in channels if not np.isfinite(plus_minus.half_widths.get(name, np.nan)).any()]:
             console.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
     requested = requested_channels(system.arms, loaded.readable, measured=False)
@@ -71,14 +61,13 @@ def predict(console: Console, calibration: Path, poses: Path, out: Path, recordi
     extra, medians = _half_widths(plus_minus, shown) if plus_minus else ({}, {})
     extra |= _beyond(console, loaded, commands, plus_minus)
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
-    _show(console, commands, out, recording, plus_minus, medians)
+    _show(console, commands, out, plus_minus, medians)
 
 
 def _show(
     console: Console,
     commands: Dataset,
     out: Path,
-    recording: str,
     plus_minus: PlusMinus | None,
     medians: Mapping[str, float],
 ) -> None:
@@ -95,7 +84,6 @@ def _show(
             "poses": len(commands),
             "set_aside": len(commands.set_aside),
             "out": str(out),
-            "recording": recording,
             **typical,
             "half_width_90": medians,
         }
@@ -134,7 +122,7 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path) ->
     return noticed(records_of(reader, ReadRequest(arms, {}, requested, layout_hint=_LAYOUT)))
 
 
-def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, recording: str) -> None:
+def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset) -> None:
     """What the calibration knew and these poses do not say."""
     order = ("time", "sequence")
     missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]
@@ -148,11 +136,9 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset, r
     for text in commands.warnings:
         console.warn(text)
     kept = loaded.record.prediction
-    if kept is not None and kept.recording is None and recording == "calibrated":
-        console.warn("no parameter drifts in this calibration: all recordings are alike.")
-    if kept is not None and kept.recording is not None and recording == "new" and any(map(commands.has, order)):
-        text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known"
-        console.warn(f"{text}; if they belong to it, say --recording calibrated.")
+    if kept is not None and kept.drifts and any(map(commands.has, order)):
+        text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known."
+        console.warn(text)
 
 
 def _beyond(

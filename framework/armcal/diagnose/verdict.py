@@ -25,7 +25,6 @@ from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.identifiability import deviations as deviations_of
 from armcal.estimate.prediction import NewRecording
-from armcal.estimate.start import certificates
 from armcal.estimate.validation import Halves, pose_size, summarise
 from armcal.measure.measurement import Placed
 from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
@@ -333,9 +332,7 @@ def places(fit: Fit) -> list[Finding]:
     estimate, problem = fit.estimate, fit.problem
     if not fit.converged or not estimate.names:
         return []
-    shown = certificates(fit.ready.training, estimate.values, fit.ready.trained)
-    texts = [*known_accuracies(problem, estimate, fit.of(by_halves)), *(f"{name}: {t}" for name, t in shown.items())]
-    return [Finding("note", text) for text in texts]
+    return [Finding("note", text) for text in known_accuracies(problem, estimate, fit.of(by_halves))]
 
 
 def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:

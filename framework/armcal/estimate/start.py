@@ -27,7 +27,7 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.units import digits
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.polish import descended
-from armcal.measure.instrument import Certifying, Proposing, Reading
+from armcal.measure.instrument import Proposing, Reading
 from armcal.measure.measurement import Carried, borrowed_names
 from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.rigid_alignment import (
@@ -369,17 +369,6 @@ def _with_proposal(start: Start, dataset: Dataset, number: int, measurement: Pro
     names = (*start.names, *(own[local].name for local in proposal.values))
     placed, vectors = problem.with_parameters(parameters.with_nominal(moved)), (vector, *start.vectors)
     return replace(start, problem=placed, names=names, vectors=vectors, configured=configured, left=left, taken=True)
-
-
-def certificates(problem: Problem, values: Array, dataset: Dataset) -> dict[str, str]:
-    """What measurements show of whether another answer could be better, sentences by their names."""
-    sentences = {}
-    for number, kernel in enumerate(problem.kernels):
-        measurement = problem.blueprint.measurements[kernel.factor.name]
-        if isinstance(measurement, Certifying):
-            reading = _reading(problem, values, values, dataset, number)
-            sentences[kernel.factor.name] = measurement.certificate(reading)
-    return {name: text for name, text in sentences.items() if text}
 
 
 def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:

@@ -52,7 +52,7 @@ def records_of(reader: Reader, request: ReadRequest) -> Dataset:
                 refuse(reader.read, given, f"a numpy array of {count} numbers (float64), one a record")
         if len(dataset.rows) not in (0, count):
             refuse(reader.read, f"{len(dataset.rows)} rows", f"{count} of them, or none")
-        for name, texts in {**dataset.extra, **dataset.files}.items():
+        for name, texts in dataset.extra.items():
             if len(texts) != count:
                 refuse(reader.read, f"{len(texts)} texts as {name!r}", f"{count}, one a record")
         for requested in request.channels:

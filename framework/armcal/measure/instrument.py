@@ -200,14 +200,6 @@ class Proposing(Protocol):
 
 
 @runtime_checkable
-class Certifying(Protocol):
-    """What a measurement provides beside the rest if it can show that no other answer is better."""
-
-    def certificate(self, reading: Reading) -> str:
-        """Whether its parameters are the best there are, as a sentence; empty if there is nothing to show."""
-
-
-@runtime_checkable
 class PointMeasurement(Protocol):
     """What a measurement provides beside the rest if it reads the same of each of many points.
 

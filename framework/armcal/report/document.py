@@ -53,8 +53,6 @@ class Panel:
     down: bool = False  # the vertical axis points down
     low: float | None = None  # where the vertical axis begins; else with the data
     high: float | None = None
-    backdrop: str = ""  # an image below the marks, as an address of its content
-    size: tuple[float, float] | None = None  # width and height of the image, which are the axes' ends
 
 
 @dataclass(frozen=True)

@@ -72,9 +72,6 @@ def drawn(figure: Figure, ident: str) -> list[Markup]:
 def _panel(figure: Figure, panel: Panel, ident: str) -> Markup:
     x, y, bottom = _axes(panel)
     parts = [] if panel.bare else _frame(panel, x, y)
-    if panel.backdrop:
-        size = f'width="{x.end - x.start:.0f}" height="{abs(y.end - y.start):.1f}"'
-        parts.append(f'<image href="{escape(panel.backdrop)}" x="{x.start:.0f}" y="{min(y.start, y.end):.0f}" {size}/>')
     for marks in panel.marks:
         parts.append(_marks(marks, x, y))
     title = f"{figure.title}: {panel.title}" if panel.title else figure.title
@@ -87,10 +84,6 @@ def _panel(figure: Figure, panel: Panel, ident: str) -> Markup:
 
 def _axes(panel: Panel) -> tuple[Axis, Axis, float]:
     """Both axes, and the height of the panel."""
-    if panel.size is not None:
-        width, height = panel.size
-        tall = WIDTH * height / width
-        return Axis(0, width, 0, WIDTH), Axis(height, 0, tall, 0), tall
     of_x = np.concatenate([np.zeros(0), *(m.xy[0] for m in panel.marks)])
     of_y = np.concatenate([np.zeros(0), *(m.xy[1] for m in panel.marks)])
     low, high = _ends(of_x, panel.log)

@@ -15,11 +15,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of, rotation_matrix, rpy_matrices
 from armcal.base.units import DIMENSIONLESS, UNITS, split_suffix
 from armcal.calibration.calibration import Calibration, arm_named
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.nominal import Sent, nominal_arm
-from armcal.calibration.compensation.reach import Reach
-from armcal.calibration.compensation.request import FARTHEST_M, Commands, Options, Redundancy, Targets
-from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point
+from armcal.calibration.compensation import Commands, Compensator, Options, Reach, Sent, Targets, nominal_arm
+from armcal.calibration.inverse import FARTHEST_M
+from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point, tool_point
 from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.functions.batch_function import EvaluatorChoice
@@ -188,7 +186,6 @@ class Bench:
         calibration: Calibration,
         arm: str | None,
         within: Path | None,
-        redundancy: Redundancy,
         registry: PluginRegistry,
         point: Point = "tool",
     ) -> Self:
@@ -201,7 +198,7 @@ class Bench:
         joints = tuple(calibration.system.arms[name].commanded)
         space = workspace_of(within, joints, registry) if within else Workspace()
         target = measured_point(calibration.system, name, calibration.parameters.with_free(calibration.free))
-        options = Options(limits=space.limits, redundancy=redundancy)
+        options = Options(limits=space.limits)
         return cls(calibration, name, options, space, target, point)
 
     @property
@@ -235,7 +232,10 @@ class Bench:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
 
     def nominal(self) -> Compensator:
-        return nominal_arm(self.calibration, self.arm, self.point, self.options)
+        """The arm as its controller has it."""
+        system, nominal = self.calibration.system, self.calibration.nominal
+        at = tool_point(self.point, system, self.arm, nominal)
+        return nominal_arm(system.arms[self.arm], nominal, system.environment, self.options, at)
 
 
 def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: Commands) -> Assessed:

@@ -14,8 +14,7 @@ from armcal.arm.joints import by_dimension, joint_limits
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
-from armcal.calibration.compensation.compensator import Compensator
-from armcal.calibration.compensation.request import Options
+from armcal.calibration.compensation import Compensator, Options
 from armcal.calibration.tool_expression import arm_expression
 from armcal.errors import ProblemError
 from armcal.run.experiment import Experiment, PlanSettings

@@ -13,7 +13,7 @@ import numpy as np
 from armcal.arm.effects import JointEffect
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset, SetAside
-from armcal.calibration.intervals import PredictionRecord, covariance_rows, recording_record
+from armcal.calibration.intervals import PredictionRecord, covariance_rows
 from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
 from armcal.diagnose.checks import DATA_CHECKS, first_few, plugin_checks
 from armcal.diagnose.coverage import fit_and_predict, intervals
@@ -324,7 +324,7 @@ def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | Non
         covariance=covariance_rows(own.estimate.covariance),
         stretches=dict(own.of(intervals).stretches),
         columns={str(name): str(local) for name, local in columns.items()},
-        recording=recording_record(own.fitted.problem, own.ready.trained),
+        drifts={b.name: b.drift for b in own.fitted.problem.parameters.free if b.drift is not None},
         ranges=ranges,
     )
 

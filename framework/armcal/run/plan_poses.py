@@ -14,7 +14,7 @@ from armcal.arm.assembly import command_channels, shown_joint, within_couplings
 from armcal.arm.joints import Limits, by_dimension
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
-from armcal.calibration.compensation.finder import Allowed
+from armcal.calibration.inverse import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, Location, ProblemError
 from armcal.measure.checks import records_of

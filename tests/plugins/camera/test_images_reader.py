@@ -18,14 +18,13 @@ from armcal.measure.reader import ReadRequest, RequestedChannel
 
 pytest.importorskip("cv2")
 import cv2
-from armcal_camera import images_reader
 from armcal_camera.board import Board, Chessboard
 from armcal_camera.images_reader import ImagesReader, ImagesSettings, corners_text, read_corners
 from armcal_camera.pose_table import FLANGE
 from armcal_camera.render import Exposure, Lens, render
 from scipy.spatial.transform import Rotation
 
-from tests.plugins.camera.sheets import CHARUCO, SIZE, facing
+from tests.plugins.camera.sheets import CHARUCO, SIZE, facing, projected
 
 BOARD = Chessboard.si(type="chessboard", columns=5, rows=4, square=0.04)
 LENS = Lens((600.0, 600.0), (320.0, 240.0))
@@ -36,12 +35,6 @@ TURNS = [(0.1 * i, 0.2 - 0.1 * i, 0.05 * i) for i in range(COUNT)]
 @dataclass
 class Camera:
     boards: tuple[Board, ...] = (BOARD,)
-
-
-@pytest.fixture(autouse=True, name="cache")
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("ARMCAL_CACHE_DIR", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 @cache
@@ -65,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 
 def truth(i: int) -> Any:
     pose = facing(BOARD, TURNS[i])
-    return LENS.project(BOARD.points @ pose[:3, :3].T + pose[:3, 3])
+    return projected(LENS, BOARD.points @ pose[:3, :3].T + pose[:3, 3])
 
 
 def request_of(joints: tuple[str, ...] = ("q1", "q2"), camera: Camera | None = None) -> ReadRequest:
@@ -113,25 +106,6 @@ def test_how_much_is_looked_at_is_reported(folder: Path) -> None:
     two = replace(asked, measurements={"left": Camera(), "right": Camera()}, channels=joints)
     read(two, folder={"left": str(folder), "right": str(folder)}, poses=folder / "poses.csv")
     assert seen == sorted(seen) and 0.5 in seen and seen[-1] == 1.0
-
-
-@pytest.mark.slow
-def test_detections_are_kept_by_content(folder: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = read(folder=folder, poses=folder / "poses.csv")
-
-    def never(image: object, board: object) -> None:
-        raise AssertionError("an image was looked at again")
-
-    monkeypatch.setattr(images_reader, "detect", never)
-    again = read(folder=folder, poses=folder / "poses.csv")
-    assert len(list((cache / "corners").iterdir())) == COUNT
-    for name, values in first.channels.items():
-        np.testing.assert_array_equal(values, again.channels[name])
-    assert first.sha256 == again.sha256
-    for path in (cache / "corners").iterdir():
-        path.write_text('{"corners": [[1, 2')
-    with pytest.raises(AssertionError, match="looked at again"):
-        read(folder=folder, poses=folder / "poses.csv")
 
 
 @pytest.mark.slow

@@ -20,6 +20,8 @@ ROS = {
     "distortion_model": "plumb_bob",
     "distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.1, 0.02, 0.001, -0.001, 0.0]},
 }
+EIGHT = {"rows": 1, "cols": 8, "data": [-0.1, 0.02, 0.001, -0.001, 0.0, 0.0, 0.0, 0.0]}
+RATIONAL = {**ROS, "distortion_model": "rational_polynomial", "distortion_coefficients": EIGHT}
 KALIBR = {
     "cam0": {
         "camera_model": "pinhole",
@@ -37,7 +39,9 @@ def written(folder: Path, content: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("content", "model", "count"), [(ROS, "pinhole", 5), (KALIBR, "fisheye", 4)])
+@pytest.mark.parametrize(
+    ("content", "model", "count"), [(ROS, "pinhole", 5), (RATIONAL, "pinhole", 5), (KALIBR, "fisheye", 4)]
+)
 def test_files_of_ros_and_kalibr(tmp_path: Path, content: object, model: str, count: int) -> None:
     read = read_intrinsics(written(tmp_path, content))
     assert np.allclose([read.fx, read.fy, read.cx, read.cy], [0.9, 0.91, 0.6405, 0.40025])
@@ -59,7 +63,10 @@ def test_a_file_that_opencv_wrote(tmp_path: Path) -> None:
     [
         ("a: [", "it is not YAML"),
         ({"some": 1}, "no camera matrix"),
-        ({**ROS, "distortion_model": "rational_polynomial"}, "the distortion model 'rational_polynomial'"),
+        (
+            {**RATIONAL, "distortion_coefficients": {**EIGHT, "data": [0.1] * 8}},
+            "the distortion model 'rational_polynomial'",
+        ),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, content: object, expected: str) -> None:

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 pytest.importorskip("cv2")
 from armcal_camera.render import Exposure, Lens, render
 
-from tests.plugins.camera.sheets import CHESSBOARD, SIZE, facing
+from tests.plugins.camera.sheets import CHESSBOARD, SIZE, facing, projected
 
 LENS = Lens((600.0, 600.0), (320.0, 240.0))
 BOARD = {"type": "chessboard", "columns": 9, "rows": 6, "square_mm": 25}
@@ -45,6 +45,6 @@ def test_images_of_a_recording_become_records_of_corners(tmp_path: Path, monkeyp
     exact = Experiment.load(tour.config).read()
     np.testing.assert_allclose(dataset.stacked(bags.CHANNELS), exact.stacked(bags.CHANNELS), atol=3e-5)
     for i, pose in enumerate(poses):
-        expected = LENS.project(CHESSBOARD.points @ pose[:3, :3].T + pose[:3, 3])
+        expected = projected(LENS, CHESSBOARD.points @ pose[:3, :3].T + pose[:3, 3])
         pixels = [[1000 * dataset.column(f"camera.{axis}_{k}")[i] for axis in "uv"] for k in range(len(expected))]
         np.testing.assert_allclose(pixels, expected, atol=0.1)

@@ -11,10 +11,7 @@ from numpy.typing import NDArray
 
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.arrays import Array, Indices
-from armcal.calibration.compensation.finder import Allowed
-from armcal.calibration.compensation.request import Targets
-from armcal.calibration.compensation.search import Solutions, Solver
-from armcal.calibration.compensation.step import slope_function
+from armcal.calibration.inverse import Allowed, Solutions, Solver, slope_function
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import Equilibrium, ToolExpression, sample_inputs
 from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
@@ -135,45 +132,49 @@ class Rounding:
         """For the targets of a solver."""
         self._counts, self._equilibrium, self._solver = counts, equilibrium, solver
 
-        def slope() -> BatchFunction:
-            return BatchFunction(slope_function(expression, solver.turns), sample_inputs(expression), choice)
+        turns = solver.aim == "pose"
 
-        self._slope = expression.made(("slope", solver.turns, choice), slope)
-        self._weights = np.array([1.0] * 3 + [solver.length] * (3 if solver.turns else 0))
+        def slope() -> BatchFunction:
+            return BatchFunction(slope_function(expression, turns), sample_inputs(expression), choice)
+
+        self._slope = expression.made(("slope", turns, choice), slope)
+        self._weights = np.array([1.0] * 3 + [solver.length] * (3 if turns else 0))
 
     def __call__(
-        self, record: Array, solutions: Solutions, targets: Targets, allowed: Allowed | None
+        self, record: Array, solutions: Solutions, target: Array, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
-        """Counts and what they make (n x N each) for records with the exact commands."""
+        """Counts and what they make (n x N each) for records with the exact commands, and targets (3 or 12 x N)."""
         counts, commands = np.zeros(solutions.commands.shape, dtype=np.int64), np.zeros_like(solutions.commands)
         for start in range(0, record.shape[1], _ROUNDED_AT_ONCE):
             part = slice(start, start + _ROUNDED_AT_ONCE)
-            counts[:, part], commands[:, part] = self._part(record[:, part], solutions, targets, part, allowed)
+            some = solutions.commands[:, part], solutions.states[:, part], target[:, part]
+            counts[:, part], commands[:, part] = self._part(record[:, part], *some, allowed)
         return counts, commands
 
     def _part(
-        self, record: Array, solutions: Solutions, targets: Targets, part: slice, allowed: Allowed | None
+        self, record: Array, exact: Array, states: Array, target: Array, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
-        exact = solutions.commands[:, part]
         joints, count = exact.shape
-        slopes = self._slope(record, solutions.states[:, part])[0].reshape(joints, len(self._weights), count)
+        slopes = self._slope(record, states)[0].reshape(joints, len(self._weights), count)
         weighted = slopes.transpose(2, 1, 0) * self._weights[None, :, None]
-        left = self._left(self._equilibrium(record, solutions.states[:, part]).base_T_tool, targets, part)
+        left = _left(self._equilibrium(record, states).base_T_tool, target)
         near = self._counts.near(exact, self._solver.limits)
         counts, commands = self._counts.best(near, exact, weighted, left * self._weights[:, None])
         tried = np.repeat(record, TRIED, axis=1)
         tried[:joints] = commands.reshape(joints, -1)
-        standing = self._equilibrium(tried, np.repeat(solutions.states[:, part], TRIED, axis=1))
-        away = self._left(standing.base_T_tool, targets, np.repeat(np.arange(len(targets))[part], TRIED))
+        standing = self._equilibrium(tried, np.repeat(states, TRIED, axis=1))
+        away = _left(standing.base_T_tool, np.repeat(target, TRIED, axis=1))
         cost = ((away * self._weights[:, None]) ** 2).sum(axis=0)
         barred = ~standing.settled if allowed is None else ~(standing.settled & allowed(tried[:joints]))
         best = np.where(barred, np.inf, cost).reshape(count, TRIED).argmin(axis=1)
         rows = np.arange(count)
         return counts[:, rows, best], commands[:, rows, best]
 
-    def _left(self, tools: Array, targets: Targets, rows: slice | Array) -> Array:
-        """From tools to targets (3 or 6 x N): m, and rad in the base frame."""
-        away = (targets.positions[rows] - tools[:, :3, 3]).T
-        if targets.rotations is None:
-            return away
-        return np.concatenate([away, turn_between(tools[:, :3, :3], targets.rotations[rows]).T])
+
+def _left(tools: Array, target: Array) -> Array:
+    """From tools (N x 4 x 4) to targets (3 or 12 x N): m, and rad in the base frame (3 or 6 x N)."""
+    away = target[:3] - tools[:, :3, 3].T
+    if len(target) == len(away):
+        return np.asarray(away)
+    rotations = target[3:].T.reshape(-1, 3, 3).transpose(0, 2, 1)
+    return np.concatenate([away, turn_between(tools[:, :3, :3], rotations).T])
