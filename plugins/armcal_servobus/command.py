@@ -203,18 +203,18 @@ def home(
     that are named, or of all. The differences are shown first, and how to take them back.
     """
     with _opened(config, overrides) as at:
-        held_at, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
+        degrees, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
         zeros = {} if calibration is None else _zeros(console, calibration, arm_name, at.joints)
-        for name in (*held_at, *counts):
+        for name in (*degrees, *counts):
             if name not in at.joints:
                 listed = ", ".join(at.joints)
                 raise InputError(f"found no joint {name}, expected one of {listed}.", hint="Correct its name.")
-        chosen = {*held_at, *counts} or set(zeros) or set(at.joints)
+        chosen = {*degrees, *counts} or set(zeros) or set(at.joints)
         joints = {name: joint for name, joint in at.joints.items() if name in chosen}
         if release:
             for joint in reversed(joints.values()):
                 Servos(at.bus, joints).release(joint)
-        stated = Stated({name: math.radians(degrees) for name, degrees in held_at.items()}, zeros, counts)
+        stated = Stated({name: math.radians(angle) for name, angle in degrees.items()}, zeros, counts)
         plans = planned(at.bus, joints, stated)
         _show_plans(console, config, plans)
         if not yes and not sys.stdin.isatty():
@@ -242,11 +242,11 @@ def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping
     """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
     from armcal.calibration.joint_zeros import zeros_of
 
-    known, reasons = zeros_of(calibration, arm, console.registry())
+    zeros, reasons = zeros_of(calibration, arm, console.registry())
     for name, reason in reasons.items():
         console.warn(f"{name} keeps its zero: {reason}.")
     by_local = {name: name.rpartition(".")[2] for name in joints}
-    return {name: math.radians(known[local].degrees) for name, local in by_local.items() if local in known}
+    return {name: math.radians(zeros[local].degrees) for name, local in by_local.items() if local in zeros}
 
 
 def _numbers(stated: Sequence[str], number: Callable[[str], Number], example: str) -> dict[str, Number]:

@@ -117,7 +117,7 @@ def _mistakes(joint: ServoJoint, stored: Stored) -> list[Mistake]:
     stated, mode = joint.settings.offset, joint.model.map.position_mode
     if stated is not None and stated != stored.offset:
         what = f"holds the homing offset {stored.offset}, expected {stated}"
-        mend = f"Write it with armcal bus home --offset {joint.name}={stated}, or correct offset."
+        mend = f"Write it with armcal bus home CONFIG --offset {joint.name}={stated}, or correct offset."
         mistakes.append(Mistake(joint.label, what, mend))
     if stored.mode != mode:
         what = f"is in operating mode {stored.mode}, expected {mode} (positions)"
