@@ -20,6 +20,7 @@ from armcal_lerobot.motor_file import MotorFile, Units, is_gripper, read_json, r
 
 STATE, ACTION = "observation.state", "action"
 _MAX_META = 64 << 20
+_MOST_FRAMES = 5_000_000  # 46 hours at 30 frames a second: they are in memory at once
 _ROWS_AT_ONCE = 4096
 _VERSIONS = ("v2.0", "v2.1", "v3.")
 _WHOLE = "Take it whole from where it was recorded."
@@ -100,8 +101,10 @@ def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | No
     if not str(version).startswith(_VERSIONS):
         text = f"found codebase_version {str(version)[:20]!r}, expected v2.1 or v3.0."
         raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
-    if not (isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 1 <= frames < 1 << 53):
-        text = f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1."
+    are_numbers = isinstance(fps, int | float) and isinstance(frames, int)
+    if not (are_numbers and 1 <= fps <= 10_000 and 1 <= frames <= _MOST_FRAMES):
+        most = f"at most {_MOST_FRAMES:,} frames"
+        text = f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1, and {most}."
         raise DataError(text, where=where, hint=_WHOLE)
     state, action = (_motors(info.get("features"), feature, where) for feature in (STATE, ACTION))
     if state != action:

@@ -28,8 +28,7 @@ from armcal.errors import ConfigError
 from pydantic import Field
 from typing_extensions import override
 
-from armcal_servobus.bus import SILENT_MEND, Bus
-from armcal_servobus.finding import looked_at, present
+from armcal_servobus.bus import SILENT_MEND, Bus, looked_at, present
 from armcal_servobus.joints import ServoJoint, ServoJointsSettings, ServoReading, Servos, bus_of, drivable
 
 _READ_TWICE = 2

@@ -7,8 +7,7 @@ import time
 
 import pytest
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal_servobus.bus import Bus, BusSettings
-from armcal_servobus.finding import FoundServo, looked_at, present
+from armcal_servobus.bus import Bus, BusSettings, FoundServo, looked_at, present
 
 from tests.plugins.servobus.fake_bus import FakeBus, sts, xl430
 

@@ -13,7 +13,7 @@ from armcal.cli.main import cli
 from armcal.config.yaml_source import load_config
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
-from armcal_servobus.homing import Stated, planned
+from armcal_servobus.command import Stated, planned
 from armcal_servobus.joints import ServoJointsSettings
 from click.testing import CliRunner, Result
 

@@ -11,9 +11,8 @@ import tty
 
 import pytest
 from armcal.devices.device import DeviceError
-from armcal_servobus.bus import Bus, BusSettings
+from armcal_servobus.bus import Bus, BusSettings, looked_at, present
 from armcal_servobus.device import ServoBusDevice
-from armcal_servobus.finding import looked_at, present
 from servo_bus_parts import BusOnDesk
 
 JOINTS = ("q1", "q2")
