@@ -101,8 +101,9 @@ def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | No
     if not str(version).startswith(_VERSIONS):
         text = f"found codebase_version {str(version)[:20]!r}, expected v2.1 or v3.0."
         raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
-    are_numbers = isinstance(fps, int | float) and isinstance(frames, int)
-    if not (are_numbers and 1 <= fps <= 10_000 and 1 <= frames <= _MOST_FRAMES):
+    if not (
+        isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 1 <= frames <= _MOST_FRAMES
+    ):
         most = f"at most {_MOST_FRAMES:,} frames"
         text = f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1, and {most}."
         raise DataError(text, where=where, hint=_WHOLE)

@@ -249,12 +249,13 @@ def write_offset(bus: Bus, plan: Homing) -> None:
         DeviceError: it holds another value afterwards, or does not report what it should.
     """
     servo, target = plan.joint.id, (plan.position + plan.moved) % COUNTS
-    written = {"offset": plan.after}
-    if "lock" in bus.map.registers:
-        phase = bus.number(servo, "phase")
-        written = {"lock": 0, "phase": phase & ~SEVERAL_TURNS, **written, "lock again": 1}
-    for name, value in written.items():
-        bus.set_number(servo, name.split()[0], value)
+    written = [("offset", plan.after)]
+    if bus.settings.protocol == "feetech":
+        if (phase := bus.number(servo, "phase")) & SEVERAL_TURNS:
+            written.append(("phase", phase & ~SEVERAL_TURNS))
+        written = [("lock", 0), *written, ("lock", 1)]
+    for name, value in written:
+        bus.set_number(servo, name, value)
         time.sleep(_EEPROM_S)
     after, position = bus.number(servo, "offset"), bus.number(servo, "position")
     if after != plan.after or abs(_nearest(position - target)) > _SAME_COUNTS:
@@ -327,7 +328,7 @@ def _show_plans(console: Console, config: Path, plans: Sequence[Homing]) -> None
     rows = ((p.joint.name, p.joint.id, p.position, p.before, p.after, f"{p.change_deg:+.2f}") for p in plans)
     console.table(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"), rows)
     back = " ".join(f"--offset {plan.joint.name}={plan.before}" for plan in plans)
-    console.line(f"To take them back: armcal bus home {config} {back}")
+    click.echo(f"To take them back: armcal bus home {config} {back}", err=True)  # kept nowhere else: said in any case
 
 
 def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping[str, ServoJoint]) -> dict[str, float]:
