@@ -42,6 +42,8 @@ class Stored:
 
     offset: int  # its homing offset (counts)
     limits: tuple[int, int]  # the counts between which it lets itself be driven
+    max_temperature: float  # deg C
+    voltage_range: tuple[float, float]  # V
     mode: int
     phase: int  # of a Feetech servo: directions and units, as bits
 
@@ -103,11 +105,21 @@ def examined(bus: Bus, joints: Mapping[str, ServoJoint]) -> tuple[dict[str, Stor
             mend = f"Set model, or plug in the {model.name}; ids may be exchanged."
             mistakes.append(Mistake(joint.label, f"is {other}, expected {model.name}", mend))
         else:
-            numbers = bus.numbers((joint.id,), bus.map.stored)[joint.id]
-            limits = numbers["min"], numbers["max"]
-            stored[name] = Stored(numbers["offset"], limits, numbers["mode"], numbers.get("phase", 0))
+            stored[name] = _stored(bus, joint.id)
             mistakes += _mistakes(joint, stored[name])
     return stored, mistakes
+
+
+def _stored(bus: Bus, servo: int) -> Stored:
+    numbers, volt = bus.numbers((servo,), bus.map.stored)[servo], bus.map.registers["voltage"].unit
+    return Stored(
+        offset=numbers["offset"],
+        limits=(numbers["min"], numbers["max"]),
+        max_temperature=float(numbers["max_temperature"]),
+        voltage_range=(numbers["min_voltage"] * volt, numbers["max_voltage"] * volt),
+        mode=numbers["mode"],
+        phase=numbers.get("phase", 0),
+    )
 
 
 def _mistakes(joint: ServoJoint, stored: Stored) -> list[Mistake]:
@@ -134,6 +146,7 @@ def _mistakes(joint: ServoJoint, stored: Stored) -> list[Mistake]:
 
 
 _BLOCKED_S = 1.0
+_VOLTAGE_SLACK = 0.15
 _MENDS: Mapping[str, str] = {
     "overload": "It is blocked or carries too much: take the load away, then switch its power off and on.",
     "overheating": "Let it cool, with torque off; then give it rests (bench.acquisition.heat) or less load.",
@@ -151,12 +164,15 @@ class Health:
 
     Args:
         joints: whose servos they are of.
+        stored: by joint, what their servos store.
         temperature: that is borne (deg C).
         load: share of full torque that is borne for a while.
     """
 
-    def __init__(self, joints: Mapping[str, ServoJoint], temperature: float, load: float) -> None:
-        self._joints, self._temperature, self._load = joints, temperature, load
+    def __init__(
+        self, joints: Mapping[str, ServoJoint], stored: Mapping[str, Stored], temperature: float, load: float
+    ) -> None:
+        self._joints, self._stored, self._temperature, self._load = joints, stored, temperature, load
         self._loaded_since: dict[str, float] = {}
         self._reported: set[tuple[str, str]] = set()
 
@@ -165,18 +181,22 @@ class Health:
 
         Raises:
             DeviceUnwellError: a servo is too hot, or blocked; once for each.
-            DeviceError: a servo reports an alarm.
+            DeviceError: a servo reports an alarm, or has not its voltage.
             DeviceResetError: one does not hold.
         """
         for name, reading in readings.items():
-            joint = self._joints[name]
+            joint, stored = self._joints[name], self._stored[name]
             if reading.alarms:
                 mends = " ".join(dict.fromkeys(_MENDS.get(word, "") for word in reading.alarms)).strip()
                 text = f"{joint.label} reports {' and '.join(reading.alarms)}."
                 raise DeviceError(text, hint=mends or "See the servo's manual.")
-            if reading.temperature >= self._temperature:
-                text = f"is at {reading.temperature:.0f} deg C, expected below {self._temperature:.0f}"
-                self._report(joint, text, "overheating")
+            limit = min(self._temperature, stored.max_temperature)
+            if reading.temperature >= limit:
+                self._report(joint, f"is at {reading.temperature:.0f} deg C, expected below {limit:.0f}", "overheating")
+            low, high = stored.voltage_range
+            if not low - _VOLTAGE_SLACK <= reading.voltage <= high + _VOLTAGE_SLACK:
+                text = f"{joint.label} has {reading.voltage:.1f} V, expected {low:.1f} to {high:.1f}."
+                raise DeviceError(text, hint=_MENDS["voltage"])
             if not (joint.model.knows_load and reading.has_torque and abs(reading.load) >= self._load):
                 self._loaded_since.pop(name, None)
             elif now - self._loaded_since.setdefault(name, now) >= _BLOCKED_S:
@@ -201,8 +221,8 @@ class ServoBusSettings(ServoJointsSettings):
     """The bus and its joints; how fast a servo may turn by itself, and when it counts as unwell.
 
     ``speed_deg_per_s`` and ``acceleration_deg_per_s2`` are written to the servos; they limit a step that is commanded,
-    and how fast a joint goes to its first angle. ``temperature`` is the highest that is borne; ``load_percent`` of full
-    torque for longer than a second is a joint that is blocked.
+    and how fast a joint goes to its first angle. ``temperature`` is the highest that is borne, the servo's own limit
+    where it is lower; ``load_percent`` of full torque for longer than a second is a joint that is blocked.
     """
 
     speed_deg_per_s: Annotated[float, Field(gt=0, le=720, description="at most, of a servo")] = 60.0
@@ -245,7 +265,7 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
         try:
             adapter = self._bus.open()
             stored = checked(self._bus, self._joints)
-            health = Health(self._joints, s.temperature, s.load_percent / 100)
+            health = Health(self._joints, stored, s.temperature, s.load_percent / 100)
             readings = self._servos.readings()
             health.check(readings, clock.now())
             for joint, reading in readings.items():  # one that has started anew may hold, and knows no limit

@@ -165,6 +165,7 @@ def energised(fake: FakeBus) -> tuple[ServoBusDevice, Bench]:
     ("address", "value", "fault", "words"),
     [
         (63, 66, DeviceUnwellError, r"q2 \(id 2\) is at 66 deg C, expected below 65.*Let it cool"),
+        (62, 38, DeviceError, r"q2 \(id 2\) has 3\.8 V, expected 4\.0 to 14\.0"),
         (40, 0, DeviceResetError, r"q2 \(id 2\) lost torque"),
     ],
 )
