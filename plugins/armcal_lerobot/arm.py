@@ -75,11 +75,6 @@ def wiring_of(
     return wiring
 
 
-def distances_mm(metres: Array) -> dict[str, float]:
-    """Distances (N, m) at the gripper over poses: typical (the median) and largest."""
-    return {"typical_mm": 1000 * float(np.median(metres)), "largest_mm": 1000 * float(np.max(metres))}
-
-
 class Gripper:
     """The tool of an arm: at nominal parameters, or at those of a calibration.
 
@@ -111,39 +106,25 @@ class Gripper:
         self.ranges_deg = {motor: math.degrees(e[1] - e[0]) if e else math.inf for motor, e in ends.items()}
         commands = ca.SX.sym("commands", len(self.wiring))
         full = ca.vertcat(commands, ca.DM(expression.defaults[len(self.wiring) :]))
-        outputs = [ca.SX(ca.densify(part)) for part in (expression.base_T_tool.translation, expression.efforts)]
-        at_record = ca.Function("rigid", [expression.record, expression.state], outputs)
-        place, efforts = at_record(full, ca.DM.zeros(expression.state.shape))
-        slope = ca.densify(ca.jacobian(place, commands))
-        self._function = ca.Function("gripper", [commands], [place, ca.vec(slope), efforts[: len(self.wiring)]])
+        place = ca.Function("rigid", [expression.record, expression.state], [expression.base_T_tool.translation])
+        self._place = ca.Function("gripper", [commands], [place(full, ca.DM.zeros(expression.state.shape))])
 
     def positions(self, angles: Array) -> Array:
         """The tool frame's origin (3 x N; m, base frame) for joint angles (n x N; rad); springs are at rest."""
-        return self._values(angles, 0)
-
-    def torques(self, motors: Sequence[str], degrees: Array) -> Array:
-        """Gravity about the joint of each motor (N m) for their angles (N x motors; deg); NaN without a joint."""
-        efforts, columns = self._values(self.angles(motors, degrees), 2), np.full(degrees.shape, np.nan)
-        for (motor, sense), effort in zip(self.wiring.values(), efforts, strict=True):
-            columns[:, list(motors).index(motor)] = sense * effort
-        return columns
-
-    def angles(self, motors: Sequence[str], degrees: Array) -> Array:
-        """Joint angles (n x N; rad) of motor angles (N x motors; deg)."""
-        rows = [sense * degrees[:, list(motors).index(motor)] for motor, sense in self.wiring.values()]
-        return np.asarray(np.radians(np.vstack(rows)))
+        return np.asarray(self._place.map(angles.shape[1])(angles).full())
 
     def poses(self, motors: Mapping[str, Motor]) -> Array:
         """Joint angles (n x N; rad) drawn evenly from the motors' ranges."""
-        random = np.random.default_rng(_SEED)
-        halves = [motor.range_deg / 2 for motor in motors.values()]
-        return self.angles(list(motors), np.column_stack([random.uniform(-half, half, _POSES) for half in halves]))
+        random, drawn = np.random.default_rng(_SEED), {}
+        for name, motor in motors.items():
+            drawn[name] = random.uniform(-motor.range_deg / 2, motor.range_deg / 2, _POSES)
+        return np.radians([sense * drawn[name] for name, sense in self.wiring.values()])
 
     def per_degree(self, angles: Array) -> dict[str, dict[str, float]]:
         """By motor, what one degree of its joint moves the gripper over poses (n x N; rad)."""
-        slopes = np.radians(1.0) * self._values(angles, 1).reshape(len(self.wiring), 3, -1)
-        costs = map(distances_mm, np.linalg.norm(slopes, axis=1))
-        return {motor: cost for (motor, _), cost in zip(self.wiring.values(), costs, strict=True)}
+        degrees = np.radians(np.eye(len(self.wiring)))
+        motors = [motor for motor, _ in self.wiring.values()]
+        return {motor: self._apart_mm(angles, degree[:, None]) for motor, degree in zip(motors, degrees, strict=True)}
 
     def moved_mm(self, file: MotorFile, other: MotorFile, angles: Array, units: Units) -> dict[str, float]:
         """How far another file moves the gripper at the commands of these poses (n x N; rad) by a first one."""
@@ -152,11 +133,12 @@ class Gripper:
             one, two = file.motors[name], other.motors[name]
             stretched = two.degrees_in(units) / one.degrees_in(units) - 1
             moved.append(sense * np.radians(zero_shift_deg(one, two)) + stretched * row)
-        apart = self.positions(angles + np.vstack(moved)) - self.positions(angles)
-        return distances_mm(np.linalg.norm(apart, axis=0))
+        return self._apart_mm(angles, np.vstack(moved))
 
-    def _values(self, angles: Array, output: int) -> Array:
-        return np.asarray(self._function.map(angles.shape[1])(angles)[output].full())
+    def _apart_mm(self, angles: Array, moved: Array) -> dict[str, float]:
+        """How far the gripper is apart between poses and moved ones: typically (the median), and at most."""
+        millimetres = 1000 * np.linalg.norm(self.positions(angles + moved) - self.positions(angles), axis=0)
+        return {"typical_mm": float(np.median(millimetres)), "largest_mm": float(np.max(millimetres))}
 
 
 def checked(file: MotorFile, other: MotorFile | None, gripper: Gripper | None, units: Units) -> Document:
@@ -213,17 +195,17 @@ def bus_joints(file: MotorFile, gripper: Gripper | None, model: str) -> str:
         if passed := motor.passed_end(gripper.ranges_deg[name] if gripper else None):
             raise DataError(passed, where=Location(str(file.path), field=name), hint=IN_THE_MIDDLE)
         ends = sorted(sense * (count - zero) * 360 / COUNTS_A_TURN for count in (motor.range_min, motor.range_max))
-        own = [math.ceil(10 * ends[0]) / 10, math.floor(10 * ends[1]) / 10]
+        span = [math.ceil(10 * ends[0]) / 10, math.floor(10 * ends[1]) / 10]
         joints[f"{arm}.{joint}"] = {
             "id": motor.id,
             "model": model,
             "zero_count": zero,
             "offset": motor.homing_offset,
             "direction": sense,
-            "range_deg": own,
+            "range_deg": span,
         }
         half = min(gripper.ranges_deg[name] / 2 if gripper else 180.0, 180.0)
-        limits[joint] = [max(own[0], math.ceil(-10 * half) / 10), min(own[1], math.floor(10 * half) / 10)]
+        limits[joint] = [max(span[0], math.ceil(-10 * half) / 10), min(span[1], math.floor(10 * half) / 10)]
     device = {"type": "servobus", "port": "/dev/ttyACM0", "joints": joints}
     sections = {"bench": {"device": device}, "plan": {"candidates": "continuous", "limits_deg": limits}}
     return yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=120)

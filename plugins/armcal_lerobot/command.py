@@ -14,6 +14,7 @@ from armcal_lerobot.motor_file import Units, read_motors
 
 if TYPE_CHECKING:
     from armcal_lerobot.arm import Gripper
+    from armcal_lerobot.recordings import Recording
 
 _ABOVE_ZERO = click.FloatRange(min=0, min_open=True)
 _UNITS = click.option(
@@ -22,9 +23,6 @@ _UNITS = click.option(
     default="degrees",
     show_default=True,
     help="Of recorded numbers, as use_degrees was.",
-)
-_CALIBRATION = click.option(
-    "--calibration", type=FILE, help="The follower's calibration file: turns percent into degrees."
 )
 _ARM_NAME = click.option("--arm-name", metavar="NAME", help="Which arm, where there are several.")
 _JOINTS = click.option(
@@ -44,6 +42,17 @@ def lerobot() -> None:
 def _of_arm(command: Any) -> Any:
     config = click.option("--arm", "config", type=FILE, help="The arm's configuration or calibration: gives mm.")
     return config(_ARM_NAME(_JOINTS(command)))
+
+
+def _on_dataset(command: Any) -> Any:
+    text = "The follower's calibration file: turns percent into degrees."
+    return click.argument("dataset", type=FILE)(click.option("--calibration", type=FILE, help=text)(_UNITS(command)))
+
+
+def _recording(dataset: Path, units: Units, calibration: Path | None) -> "Recording":
+    from armcal_lerobot.recordings import open_recording
+
+    return open_recording(dataset, units, read_motors(calibration) if calibration else None)
 
 
 @lerobot.command()
@@ -128,60 +137,48 @@ def zeros(
 
 
 @lerobot.command()
-@click.argument("dataset", type=FILE)
-@_CALIBRATION
-@_UNITS
-@_of_arm
+@_on_dataset
 @speaking
-def compare(console: Console, dataset: Path, calibration: Path | None, units: Units, **of_arm: Any) -> None:
+def compare(console: Console, dataset: Path, units: Units, calibration: Path | None) -> None:
     """How a follower follows its commands, joint by joint.
 
     Offset, gain, backlash and delay from recorded data, with intervals.
     """
-    from armcal_lerobot.recordings import open_recording
     from armcal_lerobot.tracking import compared
 
-    recording = open_recording(dataset, units, read_motors(calibration) if calibration else None)
-    gripper = _gripper(console, recording.motors, **of_arm)
-    if gripper and "deg" not in recording.units:
-        raise InputError("found numbers in percent, expected degrees for mm.", hint="Give --calibration FILE as well.")
-    console.show(compared(recording, gripper))
+    console.show(compared(_recording(dataset, units, calibration)))
 
 
 @lerobot.command()
-@click.argument("dataset", type=FILE)
+@_on_dataset
 @click.option("--out", type=FILE, required=True, help="The CSV file to write, a row a rest.")
 @click.option("--window-s", type=_ABOVE_ZERO, default=0.5, show_default=True, help="How long no motor moves.")
 @click.option("--spread-deg", type=_ABOVE_ZERO, default=0.5, show_default=True, help="By more than this.")
 @click.option("--angles", type=click.Choice(["state", "action"]), default="state", show_default=True, help="Which.")
-@click.option(
-    "--camera", metavar="FEATURE", help="A camera whose images at rest are written: observation.images.wrist."
-)
+@click.option("--camera", metavar="FEATURE", help="Whose images at rest are written: observation.images.wrist.")
 @click.option("--images", type=FILE, help="The folder for them.")
-@_CALIBRATION
 @_JOINTS
-@_UNITS
 @speaking
 def rests(
     console: Console,
     dataset: Path,
+    units: Units,
+    calibration: Path | None,
     out: Path,
     camera: str | None,
     images: Path | None,
-    calibration: Path | None,
     joints: Sequence[str],
-    units: Units,
     **how: Any,
 ) -> None:
     """Where an arm rested in a data set, as records.
 
     A CSV to calibrate from, and a camera's images of these moments.
     """
-    from armcal_lerobot.recordings import open_recording, records_of, write_images, write_records
+    from armcal_lerobot.recordings import records_of, write_images, write_records
 
     if (camera is None) != (images is None):
         raise InputError("found one of --camera and --images, expected both.", hint="Give both, or none.")
-    recording = open_recording(dataset, units, read_motors(calibration) if calibration else None)
+    recording = _recording(dataset, units, calibration)
     records = records_of(recording, **how)
     if camera is not None and images is not None:
         write_images(recording, camera, records, images)

@@ -1,11 +1,9 @@
-"""LeRobot's data sets, v2.1 and v3, read a stretch of frames at a time; and where the arm stood at rest in them, as
-records to calibrate from, with a camera's images of these moments.
+"""LeRobot's data sets, v2.1 and v3; and where the arm stood at rest in them, as records to calibrate from, with a
+camera's images of these moments.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +19,8 @@ from armcal_lerobot.arm import wiring_of
 from armcal_lerobot.motor_file import MotorFile, Units, is_gripper, read_json, require_motors
 
 STATE, ACTION = "observation.state", "action"
-_NUMBERS = ("episode_index", "frame_index", "timestamp")
 _MAX_META = 64 << 20
+_MOST_FRAMES = 5_000_000  # 46 hours at 30 frames a second: they are in memory at once
 _ROWS_AT_ONCE = 4096
 _VERSIONS = ("v2.0", "v2.1", "v3.")
 _WHOLE = "Take it whole from where it was recorded."
@@ -45,77 +43,27 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Recording:
-    """A data set on disk."""
+    """A data set, read whole."""
 
     folder: Path  # with ``meta`` and ``data``
     version: str  # as stated, such as v2.1
     fps: float  # frames a second
-    frames: int  # how many ``meta/info.json`` states
     motors: tuple[str, ...]  # in the order of the numbers
-    stored: Units  # what the numbers are; the gripper's are always percent
-    file: MotorFile | None  # the follower's calibration, by which percent become degrees
+    units: tuple[str, ...]  # of each motor's numbers: deg, or % (the gripper's, and all where degrees are not known)
+    stretches: tuple[Stretch, ...]  # in order
 
     @property
-    def units(self) -> tuple[str, ...]:
-        """Of each motor's numbers in the stretches: deg, or % where degrees are not known."""
-        is_percent = self.stored == "percent" and self.file is None
-        return tuple("%" if is_percent or is_gripper(motor) else "deg" for motor in self.motors)
+    def frames(self) -> int:
+        return sum(len(stretch.frame) for stretch in self.stretches)
 
-    @cached_property
+    @property
     def motion(self) -> tuple[Stretch, ...]:
         """All stretches of ten frames and more."""
-        stretches = tuple(stretch for stretch in self.stretches() if len(stretch.frame) >= _FEWEST)
+        stretches = tuple(stretch for stretch in self.stretches if len(stretch.frame) >= _FEWEST)
         if not stretches:
             text = f"found no {_FEWEST} frames in a row of one episode."
             raise DataError(text, where=Location(str(self.folder)), hint="Record episodes without gaps.")
         return stretches
-
-    def stretches(self) -> Iterator[Stretch]:
-        """All of them in order; one is in memory at a time.
-
-        Raises:
-            DataError: a file is damaged or cut off, frames are missing, or the numbers have another unit.
-            InputError: the calibration lacks a motor.
-        """
-        size = len(self.motors)
-        scale = np.ones(size)
-        if self.file is not None:
-            require_motors(self.file, self.motors)
-            degrees = [self.file.motors[motor].degrees_in(self.stored) for motor in self.motors]
-            scale = np.where([is_gripper(motor) for motor in self.motors], 1.0, degrees)
-        for (episode, _), parts in groupby(self._pieces(), key=lambda piece: (piece[0, 1], piece[0, 0])):
-            rows = np.concatenate(list(parts))
-            commanded, reached = rows[:, 4 : 4 + size] * scale, rows[:, 4 + size :] * scale
-            yield Stretch(int(episode), rows[:, 2], rows[:, 3], commanded, reached)
-
-    def _pieces(self) -> Iterator[Array]:
-        """Frames as stored, in pieces without a gap (N x (4 + 2 motors)): how far their place in the episode is behind
-        that in the data set, episode, place, time, commands and states.
-        """
-        size = len(self.motors)
-        widths = {**dict.fromkeys(_NUMBERS, 1), ACTION: size, STATE: size}
-        frames, low, high = 0, np.full(size, np.inf), np.full(size, -np.inf)
-        for path, batch in _batches(sorted((self.folder / "data").glob("chunk-*/*.parquet")), widths):
-            columns = [_numbers(path, batch, name, width) for name, width in widths.items()]
-            behind, state = np.arange(frames, frames + batch.num_rows)[:, None] - columns[1], columns[-1]
-            low, high = np.minimum(low, state.min(axis=0)), np.maximum(high, state.max(axis=0))
-            if self.stored == "percent" and np.abs(state).max() > _MOST_PERCENT:
-                text = f"found {np.abs(state).max():.1f}, expected percent."
-                hint = "Its numbers are degrees: leave --units percent out."
-                raise DataError(text, where=Location(str(path), field=STATE), hint=hint)
-            frames += batch.num_rows
-            rows = np.hstack([behind, *columns])
-            yield from np.split(rows, np.flatnonzero(np.diff(rows[:, :2], axis=0).any(axis=1)) + 1)
-        if frames != self.frames:
-            text = f"found {frames} frames, expected {self.frames} (meta/info.json)."
-            raise DataError(text, where=Location(str(self.folder / "data")), hint=_WHOLE)
-        ends = np.array([low, high])[:, [not is_gripper(name) for name in self.motors]]
-        if self.stored == "degrees" and np.ptp(ends, axis=0).max() > _RADIANS_MOVED and np.abs(ends).max() <= np.pi:
-            text = (
-                f"found {ends.min():.2f} to {ends.max():.2f} in all joints, expected degrees: they look like radians."
-            )
-            hint = "Multiply joint states and actions by 57.29578, as LeRobot records degrees or percent."
-            raise DataError(text, where=Location(str(self.folder), field=STATE), hint=hint)
 
     def video(self, camera: str, episode: int) -> tuple[Path, int]:
         """A camera's video of an episode, and the frame in it at which the episode begins."""
@@ -137,6 +85,14 @@ class Recording:
 
 
 def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | None = None) -> Recording:
+    """A data set whose numbers are in a unit (the gripper's always in percent).
+
+    With the follower's calibration file percent become degrees.
+
+    Raises:
+        DataError: a file is damaged or cut off, frames are missing, or the numbers have another unit.
+        InputError: the calibration lacks a motor.
+    """
     path = folder / "meta" / "info.json"
     where = Location(str(path))
     info = read_json(path, _MAX_META, "a LeRobot data set's meta/info.json", "Give the folder with meta and data.")[1]
@@ -145,26 +101,71 @@ def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | No
     if not str(version).startswith(_VERSIONS):
         text = f"found codebase_version {str(version)[:20]!r}, expected v2.1 or v3.0."
         raise DataError(text, where=where, hint="Convert it with LeRobot's own scripts.")
-    if not (isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 1 <= frames < 1 << 53):
-        raise DataError(
-            f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1.", where=where, hint=_WHOLE
-        )
-    motors = []
-    for feature in (STATE, ACTION):
-        features = info.get("features")
-        about = features.get(feature) if isinstance(features, dict) else None
-        names = about.get("names") if isinstance(about, dict) else None
-        names = next(iter(names.values()), None) if isinstance(names, dict) else names
-        if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
-            hint = "Only data sets of arms whose joints were recorded can be used."
-            raise DataError(f"found no feature {feature} with the names of motors.", where=where, hint=hint)
-        # shoulder_pan.pos and main_shoulder_pan are shoulder_pan.
-        motors.append(tuple(name.removesuffix(".pos").removeprefix("main_") for name in names))
-    state, action = motors
+    if not (
+        isinstance(fps, int | float) and 1 <= fps <= 10_000 and isinstance(frames, int) and 1 <= frames <= _MOST_FRAMES
+    ):
+        most = f"at most {_MOST_FRAMES:,} frames"
+        text = f"found fps {fps!r} and total_frames {frames!r}, expected numbers from 1, and {most}."
+        raise DataError(text, where=where, hint=_WHOLE)
+    state, action = (_motors(info.get("features"), feature, where) for feature in (STATE, ACTION))
     if state != action:
         text = f"found {', '.join(action)} in {ACTION} and {', '.join(state)} in {STATE}, expected the same motors."
         raise DataError(text, where=where, hint="Only joint actions can be compared with joint states.")
-    return Recording(folder, str(version), float(fps), frames, state, stored, file)
+    rows = _rows(folder, frames, len(state))
+    _require_unit(folder, rows[:, -len(state) :], [not is_gripper(name) for name in state], stored)
+    scale = np.ones(len(state))
+    if file is not None:
+        require_motors(file, state)
+        scale = np.array([1.0 if is_gripper(motor) else file.motors[motor].degrees_in(stored) for motor in state])
+    unit = "%" if stored == "percent" and file is None else "deg"
+    units = tuple("%" if is_gripper(motor) else unit for motor in state)
+    return Recording(folder, str(version), float(fps), state, units, tuple(_stretches(rows, scale)))
+
+
+def _motors(features: Any, feature: str, where: Location) -> tuple[str, ...]:
+    """The names of a feature's motors: shoulder_pan.pos and main_shoulder_pan are shoulder_pan."""
+    about = features.get(feature) if isinstance(features, dict) else None
+    names = about.get("names") if isinstance(about, dict) else None
+    names = next(iter(names.values()), None) if isinstance(names, dict) else names
+    if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+        hint = "Only data sets of arms whose joints were recorded can be used."
+        raise DataError(f"found no feature {feature} with the names of motors.", where=where, hint=hint)
+    return tuple(name.removesuffix(".pos").removeprefix("main_") for name in names)
+
+
+def _rows(folder: Path, frames: int, motors: int) -> Array:
+    """All frames as stored (N x (3 + 2 motors)): episode, place in it, time, commands, states."""
+    widths = {"episode_index": 1, "frame_index": 1, "timestamp": 1, ACTION: motors, STATE: motors}
+    parts, count = [], 0
+    for path, batch in _batches(sorted((folder / "data").glob("chunk-*/*.parquet")), widths):
+        if (count := count + batch.num_rows) <= frames:
+            parts.append(np.hstack([_numbers(path, batch, name, width) for name, width in widths.items()]))
+    if count != frames:
+        text = f"found {count} frames, expected {frames} (meta/info.json)."
+        raise DataError(text, where=Location(str(folder / "data")), hint=_WHOLE)
+    return np.vstack(parts)
+
+
+def _require_unit(folder: Path, states: Array, turning: Sequence[bool], stored: Units) -> None:
+    """Refuse states (N x motors) that are degrees in place of percent, or radians in place of degrees."""
+    where = Location(str(folder), field=STATE)
+    if stored == "percent" and np.abs(states).max() > _MOST_PERCENT:
+        hint = "Its numbers are degrees: leave --units percent out."
+        raise DataError(f"found {np.abs(states).max():.1f}, expected percent.", where=where, hint=hint)
+    joints = states[:, turning]
+    if stored == "degrees" and np.ptp(joints, axis=0).max() > _RADIANS_MOVED and np.abs(joints).max() <= np.pi:
+        span = f"{joints.min():.2f} to {joints.max():.2f}"
+        text = f"found {span} in all joints, expected degrees: they look like radians."
+        hint = "Multiply joint states and actions by 57.29578, as LeRobot records degrees or percent."
+        raise DataError(text, where=where, hint=hint)
+
+
+def _stretches(rows: Array, scale: Array) -> Iterator[Stretch]:
+    behind = np.arange(len(rows)) - rows[:, 1]  # a place in the data set less that in the episode: alike without a gap
+    cuts = np.flatnonzero((np.diff(behind) != 0) | (np.diff(rows[:, 0]) != 0)) + 1
+    for part in np.split(rows, cuts):
+        commanded, reached = np.split(part[:, 3:], 2, axis=1)
+        yield Stretch(int(part[0, 0]), part[:, 1], part[:, 2], commanded * scale, reached * scale)
 
 
 def _batches(paths: Iterable[Path], columns: Collection[str]) -> Iterator[tuple[Path, Any]]:
@@ -229,7 +230,7 @@ def records_of(recording: Recording, angles: str, window_s: float, spread_deg: f
     turning = [not is_gripper(name) for name in recording.motors]
     still = StillSettings.si(window=window_s, spread=np.radians(spread_deg))
     records = []
-    for stretch in recording.stretches():
+    for stretch in recording.stretches:
         shown = (stretch.commanded if angles == "action" else stretch.reached)[:, turning]
         approach = np.column_stack([sides(command)[0] for command in stretch.commanded[:, turning].T])
         for rest in rests(np.radians(shown.T), [], stretch.time, still):

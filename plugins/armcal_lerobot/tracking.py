@@ -1,9 +1,8 @@
-"""How a joint follows its command: delay, gain, offset, backlash and what a load does, the latter with 95 % intervals.
+"""How a joint follows its command: delay, gain, offset and backlash, all but the delay with 95 % intervals.
 
-The delay comes from frames in motion, the rest from slow ones: y = a + g p(u, b) + c T, with the command u (delayed),
-what play p of the width b leaves of it, and gravity's torque T about the joint; the slope of p by b is the side on
-which the play rests. Neighbouring frames share their errors, so intervals are by whole stretches of motion: a sandwich
-covariance by clusters [Liang1986].
+The delay comes from frames in motion, the rest from slow ones: y = a + g p(u, b), with the command u (delayed) and
+what play p of the width b leaves of it; the slope of p by b is the side on which the play rests. Neighbouring frames
+share their errors, so intervals are by whole stretches of motion: a sandwich covariance by clusters [Liang1986].
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,6 @@ from armcal.report.document import Document, Section, Table
 from scipy.ndimage import binary_dilation
 from scipy.stats import t as student
 
-from armcal_lerobot.arm import Gripper, distances_mm
 from armcal_lerobot.motor_file import teeth_of
 from armcal_lerobot.recordings import REVERSAL, Recording, sides
 
@@ -27,7 +25,6 @@ _CLUSTER_S = 3.0
 _EARLIEST_S, _LATEST_S = -0.4, 0.6
 _FEWEST_CLUSTERS, _FEWEST_SIDES = 6, 3
 _LEAST_SPAN = 3.0
-_LEAST_TORQUE = 0.02
 _LEAST_GAIN = 0.1
 _L1_STEPS, _L1_FLOOR = 10, 1e-3
 _OBSTRUCTED, _FAR = 0.5, 9.0  # deg or %, and medians: a joint that is further off did not get where it was sent
@@ -71,19 +68,17 @@ class Tracking:
     gain: Figure | None = None  # state over command, at rest
     offset: Figure | None = None  # of the state at rest, in the middle of the motion
     backlash: Figure | None = None  # by how much the command has to come back before the state does
-    load: Figure | None = None  # per N m of gravity about the joint
     doubts: tuple[str, ...] = ()  # sentences
 
 
-def trackings(recording: Recording, gripper: Gripper | None = None) -> tuple[Tracking, ...]:
-    return tuple(_tracking(recording, index, gripper) for index in range(len(recording.motors)))
+def trackings(recording: Recording) -> tuple[Tracking, ...]:
+    return tuple(_tracking(recording, index) for index in range(len(recording.motors)))
 
 
 def delayed(values: Array, frames: float) -> Array:
-    """Values (N, or N x k) so many frames later; NaN where they are not known."""
-    at = np.arange(len(values)) - frames
-    columns = [np.interp(at, np.arange(len(values)), c, left=np.nan, right=np.nan) for c in np.atleast_2d(values.T)]
-    return np.column_stack(columns) if values.ndim > 1 else columns[0]
+    """Values (N x k) so many frames later; NaN where they are not known."""
+    at = np.arange(len(values))
+    return np.column_stack([np.interp(at - frames, at, column, left=np.nan, right=np.nan) for column in values.T])
 
 
 def played(command: Array, width: float) -> Array:
@@ -95,7 +90,7 @@ def played(command: Array, width: float) -> Array:
     return values
 
 
-def _tracking(recording: Recording, index: int, gripper: Gripper | None) -> Tracking:
+def _tracking(recording: Recording, index: int) -> Tracking:
     commands = np.concatenate([stretch.commanded[:, index] for stretch in recording.motion])
     low, high = np.percentile(commands, [1, 99])
     start = Tracking(recording.motors[index], recording.units[index], float(high - low))
@@ -107,7 +102,7 @@ def _tracking(recording: Recording, index: int, gripper: Gripper | None) -> Trac
         start = replace(start, delay_s=delay, doubts=(doubt,) if doubt else ())
     width = 0.0
     for _ in range(_STEPS):  # of Gauss and Newton: the backlash
-        estimate = _at_rest(recording, index, start, gripper, width)
+        estimate = _at_rest(recording, index, start, width)
         if estimate.backlash is None:
             break
         width = max(estimate.backlash.value, 0.0)
@@ -146,13 +141,13 @@ def _delay_s(recording: Recording, index: int) -> tuple[float | None, str]:
     return (lags[best] + (before - after) / (before - 2 * least + after) / 2) / fps, ""
 
 
-def _at_rest(recording: Recording, index: int, start: Tracking, gripper: Gripper | None, width: float) -> Tracking:
-    """Gain, offset, backlash and load from slow frames: the linear fit about one width of the play."""
-    rows = _slow_rows(recording, index, (start.delay_s or 0.0) * recording.fps, width, gripper)
+def _at_rest(recording: Recording, index: int, start: Tracking, width: float) -> Tracking:
+    """Gain, offset and backlash from slow frames: the linear fit about one width of the play."""
+    rows = _slow_rows(recording, index, (start.delay_s or 0.0) * recording.fps, width)
     if len(np.unique(rows[-1])) < 2:
         text = "it hardly stands or moves slowly: only its delay can be known"
         return replace(start, doubts=(*start.doubts, text))
-    command, state, speed, side, load, cluster = rows
+    command, state, speed, side, cluster = rows
     doubts, middle = list(start.doubts), float(command.mean())
     columns = {"offset": np.ones(len(command))}
     if start.span >= _LEAST_SPAN and np.ptp(command) >= _LEAST_SPAN:
@@ -162,8 +157,6 @@ def _at_rest(recording: Recording, index: int, start: Tracking, gripper: Gripper
             columns["backlash"] = -side / 2
         else:
             doubts.append(f"it comes to rest {visits[1]} times from below and {visits[0]} from above: no backlash")
-        if np.isfinite(load).all() and np.ptp(load) > _LEAST_TORQUE:
-            columns["load"] = load - load.mean()
     matrix, target = np.column_stack(list(columns.values())), state - (middle if "gain" in columns else command)
     free = _unobstructed(matrix, target)
     if np.mean(free) < _MOST_FREE:
@@ -178,21 +171,18 @@ def _at_rest(recording: Recording, index: int, start: Tracking, gripper: Gripper
         ends = sorted(end / gain.value + width for end in (backlash.low, backlash.high))
         backlash = Figure(backlash.value / gain.value + width, *ends).no_finer(_THIRD_OF_A_COUNT)
     gain = gain.no_finer(_FINEST_GAIN) if gain else None
-    return replace(
-        start, gain=gain, offset=figures["offset"], backlash=backlash, load=figures.get("load"), doubts=tuple(doubts)
-    )
+    return replace(start, gain=gain, offset=figures["offset"], backlash=backlash, doubts=tuple(doubts))
 
 
-def _slow_rows(recording: Recording, index: int, late_by: float, width: float, gripper: Gripper | None) -> list[Array]:
-    """Command through the play, state, speed, side, torque and cluster of slow frames whose play is taken up."""
+def _slow_rows(recording: Recording, index: int, late_by: float, width: float) -> list[Array]:
+    """Command through the play, state, speed, side and cluster of slow frames whose play is taken up."""
     parts = []
     for number, stretch in enumerate(recording.motion):
-        late = delayed(stretch.commanded, late_by)
-        there = np.isfinite(late).all(axis=1)
+        late = delayed(stretch.commanded[:, [index]], late_by)[:, 0]
+        there = np.isfinite(late)
         if there.sum() < 3:
             continue
-        late, state = late[there], stretch.reached[there, index]
-        command = late[:, index]
+        command, state = late[there], stretch.reached[there, index]
         speed = np.gradient(command) * recording.fps
         quick = np.abs(speed) > SLOW_A_SECOND
         for frames in range(1, round(_SETTLES_S * recording.fps) + 1):
@@ -200,12 +190,11 @@ def _slow_rows(recording: Recording, index: int, late_by: float, width: float, g
         side, way = sides(command)
         # A motor that never left its place has no side, and its offset counts all the same.
         keep = ~quick & ((way > SETTLED) if np.ptp(command) > REVERSAL else np.ones(len(command), dtype=bool))
-        load = gripper.torques(recording.motors, late)[:, index] if gripper else np.full(len(late), np.nan)
         turns = np.cumsum(np.abs(np.diff(side, prepend=side[0])) > 0)
         blocks = np.arange(len(command)) // max(1, round(_CLUSTER_S * recording.fps))
         cluster = number * 10**10 + turns * 10**5 + blocks
-        parts.append(np.array([played(command, width), state, speed, side, load, cluster])[:, keep])
-    return list(np.hstack(parts)) if parts else [np.empty(0)] * 6
+        parts.append(np.array([played(command, width), state, speed, side, cluster])[:, keep])
+    return list(np.hstack(parts)) if parts else [np.empty(0)] * 5
 
 
 def _unobstructed(rows: Array, y: Array) -> Mask:
@@ -239,9 +228,9 @@ def _fit(rows: Array, y: Array, cluster: Array) -> list[Figure] | None:
     return [Figure(float(v), float(v - h), float(v + h)) for v, h in zip(values, half, strict=True)]
 
 
-def compared(recording: Recording, gripper: Gripper | None) -> Document:
+def compared(recording: Recording) -> Document:
     """A row a motor, what is wrong, and what the data cannot say."""
-    followed = trackings(recording, gripper)
+    followed = trackings(recording)
     content: dict[str, Any] = {
         "data": str(recording.folder),
         "frames": recording.frames,
@@ -252,16 +241,7 @@ def compared(recording: Recording, gripper: Gripper | None) -> Document:
     if is_copy(recording):
         text = "Every state is a command: one was copied from the other, and nothing was measured of the arm."
         content["findings"].insert(0, text)
-    texts = list(content["findings"])
-    if gripper is not None:
-        at_rest = content["gripper_at_rest_mm"] = error_at_rest(recording, followed, gripper)
-        if at_rest is not None:
-            typical, most = at_rest.values()
-            texts.append(f"At rest the gripper is {typical:.1f} mm off its command typically, {most:.1f} mm at most.")
-    for t in followed:
-        if t.load and t.load.low * t.load.high > 0:
-            texts.append(f"{t.motor} gives way to gravity by {t.load.shown(2)} deg per N m.")
-    texts += [f"{t.motor}: {doubt}." for t in followed for doubt in t.doubts]
+    texts = [*content["findings"], *(f"{t.motor}: {doubt}." for t in followed for doubt in t.doubts)]
     rows = []
     for t in followed:
         cells = [
@@ -274,26 +254,6 @@ def compared(recording: Recording, gripper: Gripper | None) -> Document:
     title = f"Leader and follower: {recording.folder.name}"
     section = Section("Motors", parts=[table], level="always")
     return Document(title, title, [section], summary=[*texts, LIMITS_OF_DATA], data=content)
-
-
-def error_at_rest(recording: Recording, followed: Sequence[Tracking], gripper: Gripper) -> dict[str, float] | None:
-    """How far the gripper rests from where it was commanded (mm); None if it never rests.
-
-    The command is taken as late as the motors follow it.
-    """
-    delays = [t.delay_s for t in followed if t.delay_s is not None]
-    frames = float(np.median(delays)) * recording.fps if delays else 0.0
-    distances = []
-    for stretch in recording.motion:
-        late = delayed(stretch.commanded, frames)
-        speed = np.abs(np.gradient(late, axis=0)).max(axis=1) * recording.fps
-        slow = np.isfinite(speed) & (speed < SLOW_A_SECOND)
-        here, there = (
-            gripper.positions(gripper.angles(recording.motors, part[slow])) for part in (late, stretch.reached)
-        )
-        distances.append(np.linalg.norm(here - there, axis=0))
-    apart = np.concatenate(distances)
-    return distances_mm(apart) if len(apart) else None
 
 
 def is_copy(recording: Recording) -> bool:

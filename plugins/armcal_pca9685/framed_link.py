@@ -45,7 +45,7 @@ class FramedLink(GuardedLink, Link):
 
     def __init__(self, settings: FramedSettings) -> None:
         self._settings = settings
-        self._where = Location(settings.meant)
+        self._where = Location(str(settings.port))
         self._port = SerialPort(settings)
         self._decoder = FrameDecoder()
         self._boots: int | None = None

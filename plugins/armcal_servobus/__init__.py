@@ -1,4 +1,4 @@
-"""Servos on a serial bus: Feetech STS and SCS, Dynamixel protocols 1 and 2.
+"""Servos on a serial bus: Feetech STS and Dynamixel protocol 2.
 
 The makers' libraries (dynamixel-sdk, ftservo-python-sdk, and feetech-servo-sdk before it) are not used: they share one
 layer whose calls give codes in place of errors, wait in a busy loop, and know neither an adapter's echo nor two servos

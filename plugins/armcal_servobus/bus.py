@@ -1,29 +1,29 @@
-"""A bus of servos on a serial port: instructions and answers, time-outs, repeats, and what went wrong on the way."""
+"""A bus of servos on a serial port: instructions and answers, time-outs, repeats, what went wrong on the way; and who
+is there: two servos with one id are seen by how they answer together.
+"""
 
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cache
 from types import MappingProxyType
-from typing import Annotated, Literal, Protocol
+from typing import Annotated
 
 from armcal.base.settings import Duration
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
 from pydantic import Field
-from typing_extensions import override
+
+from armcal_servobus.models import MAPS, ProtocolName, RegisterMap, ServoModel, Stretch, model_of
 
 BROADCAST = 0xFE
 LAST_ID = 0xFC
-"""The highest that all protocols know; Feetech's has 253 too, which armcal keeps free to listen for echoes."""
-ProtocolName = Literal["feetech", "dynamixel1", "dynamixel2"]
+"""The highest that both protocols know; Feetech's has 253 too, which armcal keeps free to listen for echoes."""
 
-_LEGACY_HEADER = b"\xff\xff"
-_HEADER2 = b"\xff\xff\xfd"
-_STATUS = 0x55
+_STATUS = b"\x55"
 _LONGEST = 1024
 
 
@@ -33,7 +33,6 @@ class Instruction(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
-    REBOOT = 0x08
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
 
@@ -53,129 +52,84 @@ class Received:
     """What a stretch of bytes holds."""
 
     answers: tuple[Status, ...]  # those that are whole and right, in order
-    damaged: int  # how many were damaged
-    rest: bytes  # the bytes of one that may go on
+    damaged: int = 0  # how many were damaged
+    rest: bytes = b""  # the bytes of one that may go on
 
 
-class Framing(Protocol):
-    """The packets of a protocol."""
+@dataclass(frozen=True)
+class Framing:
+    """The packets of a protocol: header, id, length of what follows, content, check."""
 
-    overhead: int  # bytes of an answer beside its data
+    header: bytes
+    size: int  # bytes of an address, of a count, of the length and of the check
+    check: Callable[[bytes], bytes]  # of all before it
+    prefix: bytes = b""  # with which the content of an answer begins
+    stuffed: bytes = b""  # what is followed by its last byte once more inside the content; empty: nothing is
+    refusals: Mapping[int, str] = field(default_factory=dict)  # by error code; empty: the byte has the bits of alarms
+
+    @property
+    def overhead(self) -> int:
+        """Bytes of an answer beside its data."""
+        return len(self.header) + 1 + 2 * self.size + len(self.prefix) + 1
+
+    def numbers(self, *numbers: int) -> bytes:
+        """Addresses and counts, as parameters have them."""
+        return b"".join(number.to_bytes(self.size, "little") for number in numbers)
 
     def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:
         """A whole instruction."""
-
-    def place(self, address: int, count: int) -> bytes:
-        """Parameters that name registers: the first one's address, and how many bytes."""
-
-    def address(self, address: int) -> bytes:
-        """Parameters that name the first register of a write."""
+        content = bytes((instruction,)) + parameters
+        if self.stuffed:
+            content = content.replace(self.stuffed, self.stuffed + self.stuffed[-1:])
+        packet = self.header + bytes((servo,)) + self.numbers(len(content) + self.size) + content
+        return packet + self.check(packet)
 
     def received(self, data: bytes) -> Received:
         """What came: answers, and what is no answer is passed over."""
-
-
-class LegacyFraming(Framing):
-    """Feetech's and Dynamixel's first: two bytes FF, a length, and the inverted sum of all after the header."""
-
-    overhead = 6
-
-    def __init__(self, refusals: Mapping[int, str]) -> None:
-        self._refusals = refusals
-
-    @override
-    def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:
-        body = bytes((servo, len(parameters) + 2, instruction)) + parameters
-        return _LEGACY_HEADER + body + bytes((checksum(body),))
-
-    @override
-    def place(self, address: int, count: int) -> bytes:
-        return bytes((address, count))
-
-    @override
-    def address(self, address: int) -> bytes:
-        return bytes((address,))
-
-    @override
-    def received(self, data: bytes) -> Received:
         answers: list[Status] = []
         damaged = at = done = 0
-        while (at := data.find(_LEGACY_HEADER, at)) >= 0:
-            if data[at + 2 : at + 3] == b"\xff":  # no id: the header begins a byte later
+        head, least = len(self.header), len(self.prefix) + 1 + self.size
+        while (at := data.find(self.header, at)) >= 0:
+            if data[at + head : at + head + 1] == b"\xff":  # no id: the header begins a byte later
                 at += 1
                 continue
-            if len(data) < at + 4 or len(data) < at + 4 + data[at + 3]:
+            start = at + head + 1 + self.size
+            length = int.from_bytes(data[at + head + 1 : start], "little")
+            end = start + length
+            if len(data) < start or (len(data) < end and length < _LONGEST):
                 return Received(tuple(answers), damaged, data[at:])
-            end = at + 4 + data[at + 3]
-            body = data[at + 2 : end - 1]
-            if data[at + 3] < 2 or data[end - 1] != checksum(body):
+            packet, check = data[at : end - self.size], data[end - self.size : end]
+            if not least <= length < _LONGEST or check != self.check(packet):
                 damaged += 1
-                at += 2
+                at += head
                 continue
-            answers.append(self._status(body))
+            content = packet[start - at :]
+            if content.startswith(self.prefix):
+                answers.append(self._status(packet[head], content[len(self.prefix) :]))
             at = done = end
-        return Received(tuple(answers), damaged, b"\xff" if data[done:].endswith(b"\xff") else b"")
+        begun = (self.header[:count] for count in range(head - 1, 0, -1))
+        rest = next((part for part in begun if data[done:].endswith(part)), b"")
+        return Received(tuple(answers), damaged, rest)
 
-    def _status(self, body: bytes) -> Status:
-        refused = [text for bit, text in self._refusals.items() if body[2] & bit]
-        return Status(body[0], body[2] & ~sum(self._refusals), ", ".join(refused), body[3:])
-
-
-class Framing2(Framing):
-    """Dynamixel's second: FF FF FD 00, a length of two bytes, stuffing, and a CRC of 16 bits."""
-
-    overhead = 11
-
-    @override
-    def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:
-        body = (bytes((instruction,)) + parameters).replace(_HEADER2, _HEADER2 + b"\xfd")
-        packet = _HEADER2 + bytes((0, servo)) + (len(body) + 2).to_bytes(2, "little") + body
-        return packet + crc16(packet).to_bytes(2, "little")
-
-    @override
-    def place(self, address: int, count: int) -> bytes:
-        return address.to_bytes(2, "little") + count.to_bytes(2, "little")
-
-    @override
-    def address(self, address: int) -> bytes:
-        return address.to_bytes(2, "little")
-
-    @override
-    def received(self, data: bytes) -> Received:
-        answers: list[Status] = []
-        damaged = at = done = 0
-        while (at := data.find(_HEADER2 + b"\0", at)) >= 0:
-            length = int.from_bytes(data[at + 5 : at + 7], "little")
-            end = at + 7 + length
-            if len(data) < at + 7 or (len(data) < end and length < _LONGEST):
-                return Received(tuple(answers), damaged, data[at:])
-            packet = data[at:end]
-            if length < 4 or length >= _LONGEST or crc16(packet[:-2]) != int.from_bytes(packet[-2:], "little"):
-                damaged += packet[7:8] == bytes((_STATUS,)) or length >= _LONGEST
-                at += 4
-                continue
-            if packet[7] == _STATUS:
-                answers.append(self._status(packet))
-            at = done = end
-        rest = data[done:][-3:]
-        return Received(tuple(answers), damaged, rest if b"\xff" in rest else b"")
-
-    def _status(self, packet: bytes) -> Status:
-        data = packet[9:-2].replace(_HEADER2 + b"\xfd", _HEADER2)
-        code = packet[8] & 0x7F
-        return Status(packet[4], packet[8] & 0x80, _REFUSALS2.get(code, f"error {code}") if code else "", data)
+    def _status(self, servo: int, content: bytes) -> Status:
+        error, data = content[0], content[1:]
+        if not self.refusals:
+            return Status(servo, error, "", data)
+        code = error & 0x7F
+        refusal = self.refusals.get(code, f"error {code}") if code else ""
+        return Status(servo, error & 0x80, refusal, data.replace(self.stuffed + self.stuffed[-1:], self.stuffed))
 
 
-def checksum(body: bytes) -> int:
-    return ~sum(body) & 0xFF
+def _inverted_sum(packet: bytes) -> bytes:
+    return bytes((~sum(packet[2:]) & 0xFF,))
 
 
-def crc16(data: bytes) -> int:
+def _crc16(packet: bytes) -> bytes:
     """CRC-16 of polynomial 0x8005, from zero, not reflected. [Dynamixel2]"""
     crc = 0
-    for value in data:
+    for value in packet:
         crc = ((crc << 8) & 0xFFFF) ^ _crc_of((crc >> 8) ^ value)
-    return crc
+    return crc.to_bytes(2, "little")
 
 
 @cache
@@ -186,30 +140,22 @@ def _crc_of(byte: int) -> int:
     return crc & 0xFFFF
 
 
+_DAMAGED = "the instruction arrived damaged"  # After this refusal the same instruction may be sent again
 _REFUSALS2 = MappingProxyType(
     {
         1: "it could not do it",
         2: "it does not know the instruction",
-        3: "the instruction arrived damaged",
+        3: _DAMAGED,
         4: "the value is out of its range",
         5: "the data have another length than the register",
         6: "the value is beyond a limit that is set in it",
         7: "the register is read-only, or locked while torque is on",
     }
 )
-DAMAGED = (_REFUSALS2[3], "the instruction arrived damaged")
-"""Refusals after which the same instruction may be sent again."""
 FRAMINGS: Mapping[ProtocolName, Framing] = MappingProxyType(
     {
-        "feetech": LegacyFraming({}),
-        "dynamixel1": LegacyFraming(
-            {
-                0x08: "the value is out of its range",
-                0x10: "the instruction arrived damaged",
-                0x40: "it does not know the instruction",
-            }
-        ),
-        "dynamixel2": Framing2(),
+        "feetech": Framing(b"\xff\xff", 1, _inverted_sum),
+        "dynamixel2": Framing(b"\xff\xff\xfd\0", 2, _crc16, _STATUS, b"\xff\xff\xfd", _REFUSALS2),
     }
 )
 
@@ -238,23 +184,22 @@ class Bus:
     """One bus. Each call is bounded in time: three tries take 0.4 s at most with the settings that it has by itself.
 
     Attributes:
-        settings: as they are now; ``baud`` changes with ``set_baud``.
-        counts: ``silent``, ``damaged``, ``repeated``, ``extra``: how often answers were so.
-        alarms: the last one of each servo that answered, by id.
+        counts: ``damaged`` and ``extra``: how often answers were so.
     """
 
     def __init__(self, settings: BusSettings, names: Mapping[int, str] | None = None) -> None:
         self.settings = settings
         self.counts: Counter[str] = Counter()
-        self.alarms: dict[int, int] = {}
+        self.map: RegisterMap = MAPS[settings.protocol]
         self._names = names or {}
         self._framing = FRAMINGS[settings.protocol]
+        self._alarms: dict[int, int] = {}  # the last one of each servo that answered, by id
         self._port = SerialPort(settings)
         self._echoes, self._is_clean = False, True
 
     @property
     def where(self) -> Location:
-        return Location(self.settings.meant)
+        return Location(str(self.settings.port))
 
     def open(self) -> str:
         """Open its port, and find out whether the adapter sends back what is sent; gives its serial number.
@@ -271,37 +216,19 @@ class Bus:
                 f"the port cannot be set to {self.settings.baud} baud ({fault}).", where=self.where, hint=hint
             ) from fault
         self._echoes, self._is_clean = False, True
-        packet = self._framing.encoded(_ECHO_ID, Instruction.READ, self._framing.place(0, 1))
+        packet = self._framing.encoded(_ECHO_ID, Instruction.READ, self._framing.numbers(0, 1))
         self._send(packet)
         self._echoes = self._heard(self.settings.reply, len(packet)).startswith(packet)
         return number
-
-    def set_baud(self, baud: int) -> None:
-        """Go on at another baud rate; see ``open``."""
-        self._port.close()
-        self.settings = self.settings.model_copy(update={"baud": baud})
-        self._port = SerialPort(self.settings)
-        self.open()
 
     def close(self) -> None:
         self._port.close()
 
     def probe(self, servo: int, reply_s: float) -> Received:
         """Ping an id once, or all with ``BROADCAST``, and take whatever comes in this time."""
-        packet = self._framing.encoded(servo, Instruction.PING)
-        self._send(packet)
-        answers, damaged = self._collect(packet, _NOBODY, lambda answer: False, reply_s)
+        received = self._exchange(self._framing.encoded(servo, Instruction.PING), _NOBODY, None, reply_s)
         self._is_clean = True  # all of that time was waited for
-        return Received(tuple(answers), damaged, b"")
-
-    def ping(self, servo: int) -> bool:
-        try:
-            self._ask(servo, Instruction.PING, b"", None)
-        except DeviceLostError:
-            return False
-        except DeviceError:  # damaged answers are answers
-            return True
-        return True
+        return received
 
     def read(self, servo: int, address: int, count: int) -> bytes:
         """Bytes of a servo's registers.
@@ -310,7 +237,7 @@ class Bus:
             DeviceLostError: it does not answer.
             DeviceError: it refuses, or all its answers are damaged.
         """
-        return self._ask(servo, Instruction.READ, self._framing.place(address, count), count).data
+        return self._ask(servo, Instruction.READ, self._framing.numbers(address, count), count).data
 
     def write(self, servo: int, address: int, data: bytes) -> None:
         """Write to a servo's registers; one that does not acknowledge it is read back.
@@ -320,7 +247,7 @@ class Bus:
             DeviceError: it refuses, or holds another value.
         """
         try:
-            self._ask(servo, Instruction.WRITE, self._framing.address(address) + data, 0)
+            self._ask(servo, Instruction.WRITE, self._framing.numbers(address) + data, 0)
         except DeviceLostError:
             if (read_back := self.read(servo, address, len(data))) != data:
                 raise DeviceError(
@@ -330,58 +257,70 @@ class Bus:
                     hint="Look at its plug and its power; a register may be locked while torque is on.",
                 ) from None
 
-    def read_all(self, servos: Iterable[int], address: int, count: int, *, together: bool = True) -> dict[int, bytes]:
-        """Registers of several servos, by id: in one exchange where they can, else one by one; see ``read``."""
+    def read_all(self, servos: Iterable[int], address: int, count: int) -> dict[int, bytes]:
+        """Registers of several servos, by id: in one exchange, and those whose answer was lost one by one."""
         missing = list(servos)
-        if not together or len(missing) < 2:
-            return {servo: self.read(servo, address, count) for servo in missing}
         data: dict[int, bytes] = {}
-        place = self._framing.place(address, count)
-        for attempt in range(self.settings.tries):
+        place = self._framing.numbers(address, count)
+        for attempt in range(self.settings.tries if len(missing) > 1 else 0):
             packet = self._framing.encoded(BROADCAST, Instruction.SYNC_READ, place + bytes(missing))
             wait = self._wait(len(packet) + len(missing) * (count + self._framing.overhead), attempt)
-            self._send(packet)
-            answers, _ = self._collect(packet, frozenset(missing), lambda answer: len(answer.data) == count, wait)
+            answers = self._exchange(packet, frozenset(missing), count, wait).answers
             data |= {answer.id: answer.data for answer in answers if len(answer.data) == count}
             missing = [servo for servo in missing if servo not in data]
             if not missing:
-                return data
-            self.counts["repeated"] += 1
+                break
         return data | {servo: self.read(servo, address, count) for servo in missing}
 
     def write_all(self, address: int, data: Mapping[int, bytes]) -> None:
-        """Write registers of several servos at once; nobody acknowledges that."""
+        """Write values of one length to several servos at once; nobody acknowledges that."""
         if not data:
             return
-        sizes = {len(value) for value in data.values()}
-        if len(sizes) != 1:
-            raise ValueError(f"found values of {sizes} bytes, expected one size")
         listed = b"".join(bytes((servo,)) + value for servo, value in data.items())
-        place = self._framing.place(address, sizes.pop())
+        place = self._framing.numbers(address, len(next(iter(data.values()))))
         packet = self._framing.encoded(BROADCAST, Instruction.SYNC_WRITE, place + listed)
         self._send(packet)
         if self._echoes:
             self._is_clean = self._heard(self.settings.reply, len(packet)) == packet
 
+    def number(self, servo: int, name: str) -> int:
+        """What a servo's register holds; see ``read``."""
+        register = self.map.registers[name]
+        return register.unpack(self.read(servo, register.address, register.size))
+
+    def set_number(self, servo: int, name: str, value: int) -> None:
+        """See ``write``."""
+        register = self.map.registers[name]
+        self.write(servo, register.address, register.pack(value))
+
+    def numbers(self, servos: Iterable[int], *stretches: Stretch) -> dict[int, dict[str, int]]:
+        """What stretches of registers hold, by id and name; see ``read``."""
+        numbers: dict[int, dict[str, int]] = {servo: {} for servo in servos}
+        for stretch in stretches:
+            for servo, data in self.read_all(numbers, *stretch).items():
+                numbers[servo] |= self.map.numbers(stretch, data)
+        return numbers
+
+    def alarms(self, servo: int) -> tuple[str, ...]:
+        """What a servo's last answer says that is wrong with it, in words; see ``read``."""
+        alarm = self._alarms.get(servo, 0)
+        if alarm and "status" in self.map.registers:  # there its answers say only that there is something
+            alarm = self.number(servo, "status")
+        return self.map.words(alarm)
+
     def name(self, servo: int) -> str:
         return f"{self._names[servo]} (id {servo})" if servo in self._names else f"the servo with id {servo}"
 
-    def _ask(self, servo: int, instruction: Instruction, parameters: bytes, count: int | None) -> Status:
-        """An answer of so many bytes (None: any), after as many tries as are allowed."""
+    def _ask(self, servo: int, instruction: Instruction, parameters: bytes, count: int) -> Status:
+        """An answer of so many bytes, after as many tries as are allowed."""
         packet = self._framing.encoded(servo, instruction, parameters)
         was_damaged = 0
-
-        def is_it(answer: Status) -> bool:
-            return answer.id == servo and (bool(answer.refusal) or count is None or len(answer.data) == count)
-
         for attempt in range(self.settings.tries):
-            self.counts["repeated"] += attempt > 0
-            self._send(packet)
-            wait = self._wait(len(packet) + (count or 0) + self._framing.overhead, attempt)
-            answers, damaged = self._collect(packet, frozenset((servo,)), is_it, wait)
-            answer = next(filter(is_it, answers), None)
-            was_damaged += damaged > 0
-            if answer is None or answer.refusal in DAMAGED:
+            wait = self._wait(len(packet) + count + self._framing.overhead, attempt)
+            received = self._exchange(packet, frozenset((servo,)), count, wait)
+            answer = next((one for one in received.answers if one.id == servo and _fits(one, count)), None)
+            was_damaged += received.damaged > 0
+            if answer is None or answer.refusal == _DAMAGED:
                 continue
             if answer.refusal:
                 raise DeviceError(
@@ -411,23 +350,22 @@ class Bus:
             heard += data
         return heard
 
-    def _collect(
-        self, packet: bytes, servos: frozenset[int], is_it: Callable[[Status], bool], wait_s: float
-    ) -> tuple[list[Status], int]:
-        """Answers until those of all servos are there or time is up, and how many were damaged.
+    def _exchange(self, packet: bytes, servos: frozenset[int], count: int | None, wait_s: float) -> Received:
+        """Send a packet, and take answers until those of all servos are there or time is up.
 
         Args:
-            packet: what was sent; an echo of it is taken away.
+            packet: an echo of it is taken away.
             servos: whose answers; where it is one, a damaged one ends the waiting.
-            is_it: whether an answer can be that to this packet.
+            count: how many bytes an answer to this packet has, if it is no refusal; None: any.
             wait_s: at most.
         """
+        self._send(packet)
         answers: list[Status] = []
-        missing, rest, damaged, echo = set(servos), b"", 0, len(packet) if self._echoes else 0
-        noise = 0
+        missing, rest, echo = set(servos), b"", len(packet) if self._echoes else 0
+        damaged = noise = 0
         until = time.monotonic() + wait_s
-        while missing and (left := until - time.monotonic()) > 0 and not (damaged and len(servos) == 1):
-            rest += self._port.read(left)
+        while missing and (longest := until - time.monotonic()) > 0 and not (damaged and len(servos) == 1):
+            rest += self._port.read(longest)
             if echo:
                 if len(rest) < echo:
                     continue
@@ -439,11 +377,88 @@ class Bus:
             noise += 0 if received.answers or received.damaged else len(rest) - len(received.rest)
             answers += received.answers
             damaged, rest = damaged + received.damaged, received.rest
-            missing -= {answer.id for answer in received.answers if is_it(answer)}
+            missing -= {answer.id for answer in received.answers if _fits(answer, count)}
         damaged += bool(missing and (rest or noise >= _NOISE))
         self._is_clean = not missing and not rest
-        self.alarms |= {answer.id: answer.alarm for answer in answers}
+        self._alarms |= {answer.id: answer.alarm for answer in answers}
         self.counts["damaged"] += damaged
         self.counts["extra"] += not missing and (bool(rest) or len(answers) > len(servos))
-        self.counts["silent"] += bool(missing) and not damaged
-        return answers, damaged
+        return Received(tuple(answers), damaged)
+
+
+def _fits(answer: Status, count: int | None) -> bool:
+    return bool(answer.refusal) or count is None or len(answer.data) == count
+
+
+_FIRST_IDS = range(31)
+"""Asked one by one where nothing else is said; beyond that only those that answer to all."""
+_BROADCAST_S = 0.25
+_ONE_S = 0.03
+_AGAIN = 4  # So often a servo is read: two with one id do not always collide. So many damaged answers are no chance.
+
+
+@dataclass(frozen=True)
+class FoundServo:
+    """A servo that answers, as it was read without writing anything to it."""
+
+    id: int
+    number: int  # of its model
+    model: ServoModel | None  # None: its number is not known
+    firmware: str = ""
+    position: int | None = None  # as it reports it (counts)
+    voltage: float | None = None  # V
+    temperature: int | None = None  # deg C
+    alarms: tuple[str, ...] = ()  # in words
+    damaged: int = 0  # so many of its answers were damaged, or followed by another one
+
+    @property
+    def is_doubled(self) -> bool:
+        return self.damaged >= _AGAIN
+
+
+def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
+    """Ids that answer, or from which something comes.
+
+    Feetech servos that are asked all at once may talk all at once: what they say then is only a hint. Where any
+    answers, those that are silent are asked once more: a packet is lost now and then.
+    """
+    hints = {answer.id for answer in bus.probe(BROADCAST, _BROADCAST_S).answers}
+    silent, there = sorted({*ids, *hints}), list[int]()
+    for _ in range(2):
+        for servo in silent:
+            heard = bus.probe(servo, _ONE_S)
+            if heard.damaged and not heard.answers:  # noise is not there again
+                heard = bus.probe(servo, _ONE_S)
+            if heard.damaged or servo in {answer.id for answer in heard.answers}:
+                there.append(servo)
+        silent = [servo for servo in silent if servo not in there]
+        if not there:
+            break
+    return sorted(there)
+
+
+def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo | None:
+    """What a servo says of itself; None: nothing. It is read several times, for two with one id do not answer alike."""
+    before = bus.counts["damaged"] + bus.counts["extra"]
+    numbers: dict[str, int] = {}
+    for _ in range(times):
+        try:
+            names = ("model", "firmware", "position", "voltage", "temperature")
+            numbers = {name: bus.number(servo, name) for name in names}
+        except DeviceError:
+            continue
+    damaged = bus.counts["damaged"] + bus.counts["extra"] - before
+    if not numbers:
+        return FoundServo(servo, 0, None, damaged=damaged) if damaged else None
+    firmware = numbers["firmware"]
+    return FoundServo(
+        servo,
+        numbers["model"],
+        model_of(bus.settings.protocol, numbers["model"]),
+        f"{firmware & 0xFF}.{firmware >> 8}" if bus.settings.protocol == "feetech" else str(firmware),
+        position=numbers["position"],
+        voltage=round(numbers["voltage"] * bus.map.registers["voltage"].unit, 3),
+        temperature=numbers["temperature"],
+        alarms=bus.alarms(servo),
+        damaged=damaged,
+    )

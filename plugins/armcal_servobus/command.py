@@ -3,18 +3,30 @@
 import math
 import sys
 import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args
 
 import click
-from armcal.cli.common import Console
-from armcal.errors import EXIT_BAD_INPUT, InputError
+from armcal.cli.common import FILE, Console, overrides, speaking
+from armcal.config.validate import validate
+from armcal.config.yaml_source import load_config
+from armcal.devices.device import DeviceError, DeviceRefusedError
+from armcal.devices.wiring import WiringRecord
+from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
-from armcal_servobus.configured import on_config, opened
-from armcal_servobus.device import examined
-from armcal_servobus.finding import find_command
-from armcal_servobus.homing import home_command, turned
-from armcal_servobus.joints import Servos
+from armcal_servobus.bus import LAST_ID, Bus, BusSettings, FoundServo, looked_at, present
+from armcal_servobus.device import SEVERAL_TURNS, ServoBusSettings, ServoStreamSettings, examined
+from armcal_servobus.joints import ServoJoint, ServoJointsSettings, Servos, bus_of, check_offset
+from armcal_servobus.models import BAUD_RATES, COUNTS, STEP, ProtocolName
+
+_SECTION = "bench"
+_KINDS: Mapping[str, type[ServoJointsSettings]] = {"device": ServoBusSettings, "joints": ServoStreamSettings}
+Number = TypeVar("Number", int, float)
+_EEPROM_S = 0.02
+_SAME_COUNTS = 4
 
 
 @click.group()
@@ -22,68 +34,324 @@ def bus() -> None:
     """Serial-bus servos: find them, check them, set their homing offsets."""
 
 
-@click.command("check")
-@on_config
-def check_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
+@bus.command()
+@click.argument("port")
+@click.option("--protocol", type=click.Choice(get_args(ProtocolName)), help="Only this one [default: each in turn].")
+@click.option("--baud", type=int, multiple=True, help="Only this baud rate; may be repeated [default: each in turn].")
+@click.option("--last-id", default=30, show_default=True, type=click.IntRange(0, LAST_ID), help="Asked one by one.")
+@speaking
+def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple[int, ...], last_id: int) -> None:
+    """List all servos on PORT.
+
+    Their baud rates, ids, models, and what they report. Nothing is written to them.
+    """
+    protocols = (protocol,) if protocol else get_args(ProtocolName)
+    spoken, servos = _searched(console, port, protocols, baud, range(last_id + 1))
+    results: list[dict[str, Any]] = []
+    for rate, servo in servos:
+        results.append({"baud": rate, "id": servo.id, "model": servo.model.name if servo.model else None})
+        results[-1] |= {"model_number": servo.number, "firmware": servo.firmware, "position": servo.position}
+        results[-1] |= {"voltage_V": servo.voltage, "temperature_C": servo.temperature}
+        results[-1] |= {"alarms": list(servo.alarms), "doubled": servo.is_doubled}
+    console.result({"port": port, "protocol": spoken, "servos": results})
+    rows = []
+    for row in results:
+        state = "two servos with this id?" if row["doubled"] else ", ".join(row["alarms"]) or "well"
+        shown = {**row, "model": row["model"] or f"model {row['model_number']}"}
+        keys = ("baud", "id", "model", "firmware", "position", "voltage_V", "temperature_C")
+        rows.append([*("" if shown[key] is None else shown[key] for key in keys), state])
+    headings = ("baud", "id", "model", "firmware", "count", "V", "deg C", "state")
+    console.table(f"{port}, {spoken}", headings, rows, left=("state",))
+    for number in sorted({row["id"] for row in results if row["doubled"]}):
+        console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
+
+
+def _searched(
+    console: Console, port: str, protocols: Sequence[ProtocolName], bauds: Sequence[int], ids: Sequence[int]
+) -> tuple[ProtocolName, list[tuple[int, FoundServo]]]:
+    """The first protocol in which servos of known models answer, else in which any do, and they with their baud rates.
+
+    Raises:
+        InputError: none answers.
+    """
+    rates = [(protocol, baud) for protocol in protocols for baud in bauds or BAUD_RATES[protocol]]
+    there: dict[ProtocolName, list[tuple[int, FoundServo]]] = {}
+    with console.progress() as show:
+        for place, (protocol, baud) in enumerate(rates):
+            if any(servo.model for spoken in there if spoken != protocol for _, servo in there[spoken]):
+                break
+            show("looking for servos", place / len(rates))
+            console.detail(f"{protocol} at {baud} baud")
+            wires = Bus(BusSettings.model_validate({"port": port, "protocol": protocol, "baud": baud}))
+            try:
+                wires.open()
+                looked = (looked_at(wires, servo) for servo in present(wires, ids))
+                servos = [(baud, servo) for servo in looked if servo is not None]
+            except DeviceRefusedError as refusal:
+                if isinstance(refusal.__cause__, ValueError):  # a baud rate that the port lacks
+                    continue
+                raise
+            finally:
+                wires.close()
+            if servos:
+                there.setdefault(protocol, []).extend(servos)
+    if not there:
+        text = f"no servo answers at {'these baud rates' if bauds else 'any baud rate'}, ids 0 to {ids[-1]}."
+        hint = "Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id."
+        raise InputError(text, where=Location(port), hint=hint)
+    return max(there.items(), key=lambda item: any(servo.model for _, servo in item[1]))
+
+
+def _on_config(command: Any) -> Any:
+    return click.argument("config", type=FILE)(overrides(speaking(command)))
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """The bus of a configuration."""
+
+    bus: Bus
+    joints: dict[str, ServoJoint]
+    checks: WiringRecord
+    adapter: str
+
+
+@contextmanager
+def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[_Opened]:
+    """Of the bench's device, or of its joint stream.
+
+    Raises:
+        ConfigError: neither is a servo bus, or its settings are refused.
+    """
+    source = load_config(config, overrides)
+    bench = source.data.get(_SECTION)
+    parts = bench if isinstance(bench, dict) else {}
+    there = (p for p in _KINDS if isinstance(parts.get(p), dict) and parts[p].get("type") == "servobus")
+    if (part := next(there, None)) is None:
+        hint = "Give bench: {device: {type: servobus, port: ..., joints: ...}}; docs/servo_bus.md has an example."
+        raise ConfigError("found no servo bus.", where=source.where((_SECTION,)), hint=hint)
+    stripped = {key: value for key, value in parts[part].items() if key != "type"}
+    data = {**source.data, _SECTION: {**parts, part: stripped}}
+    settings = validate(_KINDS[part], replace(source, data=data), (_SECTION, part))
+    joints = settings.chosen(settings.joints)
+    wires = bus_of(settings, joints)
+    adapter = wires.open()
+    try:
+        yield _Opened(wires, joints, WiringRecord.of_config(source, joints), adapter)
+    finally:
+        wires.close()
+
+
+@bus.command()
+@_on_config
+def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
     """Compare the servos with CONFIG.
 
     Ids, models, homing offsets, limits, modes, voltages, alarms. Nothing is written to them.
     """
-    with opened(config, overrides) as (wires, joints, _, _):
-        examination = examined(wires, joints)
-        there = {name: joints[name] for name in joints if name in examination.eeproms}
-        readings = Servos(wires, there).readings()
+    with _opened(config, overrides) as at:
+        stored, mistakes = examined(at.bus, at.joints)
+        there = {name: at.joints[name] for name in stored}
+        readings = Servos(at.bus, there).readings()
     rows: list[dict[str, Any]] = []
     for name, joint in there.items():
-        reading, eeprom = readings[name], examination.eeproms[name]
+        reading = readings[name]
         angle = math.degrees(joint.angle(joint.unwrapped(reading.position)))
         rows.append({"joint": name, "id": joint.id, "angle_deg": round(angle, 2), "count": reading.position})
-        rows[-1] |= {"offset": eeprom.offset, "limits": list(eeprom.limits), "voltage_V": round(reading.voltage, 2)}
-        rows[-1] |= {"temperature_C": reading.temperature, "torque": reading.has_torque, "alarms": list(reading.alarms)}
-    mistakes = [{"joint": m.joint, "what": m.what, "mend": m.mend} for m in examination.mistakes]
-    across = [name for name, joint in joints.items() if joint.crosses_seam]
-    console.result({"joints": rows, "mistakes": mistakes, "ranges_over_the_seam": across})
+        rows[-1] |= {"offset": stored[name].offset, "limits": list(stored[name].limits)}
+        rows[-1] |= {"voltage_V": round(reading.voltage, 2), "temperature_C": reading.temperature}
+        rows[-1] |= {"torque": reading.has_torque, "alarms": list(reading.alarms)}
+    across = [name for name, joint in at.joints.items() if joint.crosses_seam]
+    named = [{"joint": mistake.joint, "what": mistake.what, "mend": mistake.mend} for mistake in mistakes]
+    console.result({"joints": rows, "mistakes": named, "ranges_over_the_seam": across})
     measured = ("joint", "id", "angle_deg", "count", "offset", "voltage_V", "temperature_C")
-    shown = (
-        (*(row[key] for key in measured), ", ".join(row["alarms"]) or ("holds" if row["torque"] else "well"))
-        for row in rows
-    )
+    states = (", ".join(row["alarms"]) or ("holds" if row["torque"] else "well") for row in rows)
+    shown = ([*(row[key] for key in measured), state] for row, state in zip(rows, states, strict=True))
     headings = ("joint", "id", "deg", "count", "offset", "V", "deg C", "state")
     console.table(str(config), headings, shown, left=("state",))
     for name in across:
         console.warn(
             f"the range of {name} crosses the end of its encoder's turn: it can be read there, and not driven."
         )
-    for mistake in examination.mistakes:
+    for mistake in mistakes:
         console.warn(f"{mistake.joint} {mistake.what}. {mistake.mend}")
     if mistakes:
         sys.exit(EXIT_BAD_INPUT)
 
 
-@click.command("wiring")
-@on_config
-def wiring_command(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
-    """Check ids and directions by turning joints by hand.
+@dataclass(frozen=True)
+class Homing:
+    """What is to become of a joint's homing offset."""
 
-    The servos must be let go. armcal acquire drives only joints that were right.
+    joint: ServoJoint
+    position: int  # what it reports now (counts)
+    before: int  # the offset now (counts)
+    after: int
+
+    @property
+    def moved(self) -> int:
+        """By how many counts more it will report."""
+        return self.joint.model.map.offset_sign * (self.after - self.before)
+
+    @property
+    def change_deg(self) -> float:
+        """By how much the joint's angle is read otherwise afterwards."""
+        return math.degrees(self.joint.settings.direction * _nearest(self.moved) * STEP)
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What servos shall report or hold, by joint; joints that are not named stand at zero."""
+
+    angles: Mapping[str, float]  # where joints stand (rad)
+    zeros: Mapping[str, float]  # by how much they stand beyond what they report (rad)
+    offsets: Mapping[str, int]  # the offsets themselves (counts)
+
+    def offset(self, joint: ServoJoint, position: int, before: int) -> int:
+        """The homing offset of a servo that reports a position (counts) with another one."""
+        if joint.name in self.offsets:
+            return self.offsets[joint.name]
+        if joint.name in self.zeros and joint.name not in self.angles:
+            moved = round(joint.settings.direction * self.zeros[joint.name] / STEP)
+        else:
+            moved = round(joint.exact_count(self.angles.get(joint.name, 0.0))) - position
+        return _nearest(before + joint.model.map.offset_sign * moved)
+
+
+def planned(bus: Bus, joints: Mapping[str, ServoJoint], stated: Stated) -> list[Homing]:
+    """Offsets by which the joints' servos report what is stated where they stand.
+
+    Raises:
+        InputError: a servo holds no offset as large as needed, or is not let go; what to do is said.
+        DeviceError: a servo does not answer well.
     """
-    wrong: dict[str, str] = {}
-    with opened(config, overrides) as (wires, joints, checks, adapter):
-        servos = Servos(wires, joints)
-        for name in joints:
-            before = servos.positions()
-            click.echo(f"Turn {name} by 15 deg or more in its positive direction, then press Enter.", err=True)
-            if not sys.stdin.readline():
-                raise InputError(f"nobody pressed Enter for {name}.", hint="Run it at a terminal.")
-            if fault := turned(joints, before, servos.positions(), name):
-                wrong[name] = fault
-            console.line(f"{name}: {wrong.get(name, 'right')}.")
-    right = [name for name in joints if name not in wrong]
-    checks.note(right, wrong, {"adapter": adapter, "by": "somebody", "at": time.time()})
-    console.result({"wrong": wrong, "right": right})
-    if wrong:
-        sys.exit(EXIT_BAD_INPUT)
+    readings = Servos(bus, joints).readings()
+    if holding := [name for name in joints if readings[name].has_torque]:
+        hint = "Hold the arm, and let its servos go with --release."
+        raise InputError(f"{', '.join(holding)} hold, expected servos without torque.", where=bus.where, hint=hint)
+    plans, mends = [], []
+    for name, joint in joints.items():
+        before, position = bus.number(joint.id, "offset"), readings[name].position
+        plans.append(Homing(joint, position, before, stated.offset(joint, position, before)))
+        try:
+            check_offset(joint.model, plans[-1].after)
+        except ValueError as fault:
+            mends.append(f"{name}: {fault}")
+    if mends:
+        raise InputError(f"{'; '.join(mends)}.", hint="Nothing was written.")
+    return plans
 
 
-for _command in (find_command, check_command, wiring_command, home_command):
-    bus.add_command(_command)
+def write_offset(bus: Bus, plan: Homing) -> None:
+    """Write a homing offset to a servo's EEPROM, and read it back.
+
+    Raises:
+        DeviceError: it holds another value afterwards, or does not report what it should.
+    """
+    servo, target = plan.joint.id, (plan.position + plan.moved) % COUNTS
+    written = [("offset", plan.after)]
+    if bus.settings.protocol == "feetech":
+        if (phase := bus.number(servo, "phase")) & SEVERAL_TURNS:
+            written.append(("phase", phase & ~SEVERAL_TURNS))
+        written = [("lock", 0), *written, ("lock", 1)]
+    for name, value in written:
+        bus.set_number(servo, name, value)
+        time.sleep(_EEPROM_S)
+    after, position = bus.number(servo, "offset"), bus.number(servo, "position")
+    if after != plan.after or abs(_nearest(position - target)) > _SAME_COUNTS:
+        raise DeviceError(
+            f"{bus.name(servo)} holds the offset {after} and reports {position}, expected {plan.after} and {target}.",
+            where=bus.where,
+            hint="Was the arm moved meanwhile? Hold it still, and do it again.",
+        )
+
+
+def _nearest(counts: int) -> int:
+    """The same place of the turn, within half a turn of zero."""
+    return counts - COUNTS * round(counts / COUNTS)
+
+
+@bus.command()
+@click.option("--at", "angles", multiple=True, metavar="JOINT=DEG", help="Where a joint stands [default: all at 0].")
+@click.option("--offset", "offsets", multiple=True, metavar="JOINT=COUNTS", help="The offset itself, of a joint.")
+@click.option("--calibration", type=FILE, help="Write the zeros that this calibration.yaml found: nothing is held.")
+@click.option("--arm-name", metavar="NAME", help="Which arm of that calibration, where there are several.")
+@click.option("--release", is_flag=True, help="Let servos go that hold; hold the arm.")
+@click.option("--yes", is_flag=True, help="Write without asking.")
+@_on_config
+def home(
+    console: Console,
+    config: Path,
+    angles: tuple[str, ...],
+    offsets: tuple[str, ...],
+    calibration: Path | None,
+    arm_name: str | None,
+    release: bool,
+    yes: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Set homing offsets, after a question.
+
+    Afterwards the servos report the angles at which you hold the arm, or those that a calibration found: of the joints
+    that are named, or of all. The differences are shown first, and how to take them back.
+    """
+    with _opened(config, overrides) as at:
+        degrees, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
+        zeros = {} if calibration is None else _zeros(console, calibration, arm_name, at.joints)
+        for name in (*degrees, *counts):
+            if name not in at.joints:
+                listed = ", ".join(at.joints)
+                raise InputError(f"found no joint {name}, expected one of {listed}.", hint="Correct its name.")
+        chosen = {*degrees, *counts} or set(zeros) or set(at.joints)
+        joints = {name: joint for name, joint in at.joints.items() if name in chosen}
+        if release:
+            for joint in reversed(joints.values()):
+                Servos(at.bus, joints).release(joint)
+        stated = Stated({name: math.radians(angle) for name, angle in degrees.items()}, zeros, counts)
+        plans = planned(at.bus, joints, stated)
+        _show_plans(console, config, plans)
+        if not yes and not sys.stdin.isatty():
+            raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
+        if not yes and not click.confirm("Write these offsets to the servos?", err=True):
+            raise InputError("nothing was written.", hint="Say yes, or give --yes.")
+        at.checks.forget(joints)
+        for plan in plans:
+            write_offset(at.bus, plan)
+    changes = {p.joint.name: {"before": p.before, "after": p.after, "change_deg": p.change_deg} for p in plans}
+    console.result({"offsets": changes})
+    console.line("the offsets are written and read back.")
+    if calibration is not None:
+        console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
+
+
+def _show_plans(console: Console, config: Path, plans: Sequence[Homing]) -> None:
+    rows = ((p.joint.name, p.joint.id, p.position, p.before, p.after, f"{p.change_deg:+.2f}") for p in plans)
+    console.table(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"), rows)
+    back = " ".join(f"--offset {plan.joint.name}={plan.before}" for plan in plans)
+    click.echo(f"To take them back: armcal bus home {config} {back}", err=True)  # kept nowhere else: said in any case
+
+
+def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping[str, ServoJoint]) -> dict[str, float]:
+    """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
+    from armcal.calibration.joint_zeros import zeros_of
+
+    zeros, reasons = zeros_of(calibration, arm, console.registry())
+    for name, reason in reasons.items():
+        console.warn(f"{name} keeps its zero: {reason}.")
+    by_local = {name: name.rpartition(".")[2] for name in joints}
+    return {name: math.radians(zeros[local].degrees) for name, local in by_local.items() if local in zeros}
+
+
+def _numbers(stated: Sequence[str], number: Callable[[str], Number], example: str) -> dict[str, Number]:
+    """Numbers by joint, from ``JOINT=NUMBER``."""
+    numbers = {}
+    for text in stated:
+        name, _, value = text.partition("=")
+        try:
+            numbers[name] = number(value)
+            if not math.isfinite(numbers[name]):
+                raise ValueError
+        except ValueError as fault:
+            option, form = example.split()[0], "JOINT=DEG" if number is float else "JOINT=COUNTS"
+            raise InputError(f"found {option} {text}, expected {form}.", hint=f"Write {example}.") from fault
+    return numbers

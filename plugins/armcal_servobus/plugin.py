@@ -5,12 +5,12 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_devices(register: Register) -> None:
-    register("servobus", "armcal_servobus.device:ServoBusDevice", "serial-bus servos: Feetech STS and SCS, Dynamixel")
+    register("servobus", "armcal_servobus.device:ServoBusDevice", "serial-bus servos: Feetech STS, Dynamixel X")
 
 
 @hookimpl
 def armcal_register_joint_streams(register: Register) -> None:
-    register("servobus", "armcal_servobus.stream:ServoBusStream", "serial-bus servos of an arm guided by hand")
+    register("servobus", "armcal_servobus.device:ServoBusStream", "serial-bus servos of an arm guided by hand")
 
 
 @hookimpl

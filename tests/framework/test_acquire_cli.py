@@ -191,11 +191,11 @@ class TestRefusedBeforeAnythingMoves:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, plan: Path) -> Path:
-    """A rehearsal's, of a bench whose real adapter is known by its serial number."""
+    """A rehearsal's, of a bench whose real adapter is another one."""
     folder = tmp_path_factory.mktemp("rehearsal") / "out"
     port = free_port()
     ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
-    link = "bench.link={type: framed, serial_number: A5069RR4}"
+    link = "bench.link={type: framed, port: /dev/serial/by-id/usb-A5069RR4}"
     result = armcal("rehearse", CONFIG, "--plan", plan, "--out", folder, sets=(*SETS, *ports, link))
     assert result.exit_code == 0, result.output
     assert "unsafe was: nothing" in result.output and "armcal run" in result.output

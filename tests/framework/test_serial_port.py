@@ -176,25 +176,6 @@ class Listed:
         self.device, self.serial_number = device, serial_number
 
 
-def test_by_serial_number_wherever_it_is(pty, monkeypatch):
-    ports = [Listed(pty.name, "A1"), Listed("/dev/ttyS0", None), Listed("/dev/ttyX", "B2")]
-    monkeypatch.setattr(list_ports, "comports", lambda: ports)
-    port = SerialPort(SerialPortSettings(serial_number="A1"))
-    assert port.open() == "A1"
-    pty.unplug()
-    ports.pop(0)
-    with pytest.raises(DeviceLostError, match="serial number"):
-        port.open()
-    pty.plug()
-    ports.append(Listed(pty.name, "A1"))
-    assert port.open() == "A1"
-    ports.append(Listed("/dev/ttyY", "A1"))
-    with pytest.raises(DeviceRefusedError, match="found 2 adapters"):
-        port.open()
-    with pytest.raises(DeviceRefusedError, match=r"found 0 adapters.*B2"):
-        SerialPort(SerialPortSettings(serial_number="C3")).open()
-
-
 def test_the_serial_number_of_a_port_by_path(pty, monkeypatch):
     monkeypatch.setattr(list_ports, "comports", lambda: [Listed(pty.name, "A1")])
     assert port_at(pty.path).open() == "A1"
@@ -203,7 +184,6 @@ def test_the_serial_number_of_a_port_by_path(pty, monkeypatch):
 def test_settings():
     for bad in (
         {},
-        {"port": "/dev/a", "serial_number": "b"},
         {"port": " "},
         {"port": "loop://"},
         {"port": "a", "baud": 1},

@@ -1,4 +1,4 @@
-"""A serial port that may be unplugged at any moment: opened by path or USB serial number, alone, never blocking."""
+"""A serial port that may be unplugged at any moment: opened by its path, alone, never blocking."""
 
 import errno
 import os
@@ -6,9 +6,9 @@ import select
 import termios
 import time
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Self
+from typing import Annotated, Any, NoReturn
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from armcal.base.config_text import ConfigText
 from armcal.base.settings import Settings
@@ -34,23 +34,10 @@ PortPath = Annotated[Path, BeforeValidator(_placed)]
 
 
 class SerialPortSettings(Settings):
-    """Which port: its path (``/dev/ttyACM0``), or the serial number of its USB adapter, wherever that is plugged in."""
+    """Which port: its path, ``/dev/serial/by-id/...`` for an adapter wherever it is plugged in, and its baud rate."""
 
-    port: PortPath | None = None
-    serial_number: str | None = None
+    port: PortPath
     baud: Annotated[int, Field(ge=300, le=4_000_000)] = 115_200
-
-    @model_validator(mode="after")
-    def _one(self) -> Self:
-        if self.port is None and self.serial_number is None:
-            raise ValueError("found neither port nor serial_number, expected one of them: which serial port is meant?")
-        if self.port is not None and self.serial_number is not None:
-            raise ValueError("found both port and serial_number, expected one of them: set the other one to null")
-        return self
-
-    @property
-    def meant(self) -> str:
-        return str(self.port) if self.port is not None else f"the adapter {self.serial_number}"
 
 
 class SerialPort:
@@ -65,13 +52,13 @@ class SerialPort:
         """Open it, or open it anew, wherever it is now; gives the adapter's serial number, empty if it has none.
 
         Raises:
-            DeviceRefusedError: there is none, several could be meant, or another program has it.
+            DeviceRefusedError: there is none, or another program has it.
             DeviceLostError: it was open before, and is not there now.
         """
         import serial
 
         self.close()
-        path, serial_number = self._found()
+        path, serial_number = str(self._settings.port), self._adapter()
         try:
             self._port = serial.Serial(path, self._settings.baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, termios.error) as fault:  # pyserial's own errors are OSErrors
@@ -126,32 +113,16 @@ class SerialPort:
         self.close()
         raise DeviceLostError(
             f"the serial port is gone ({why}).",
-            where=Location(self._settings.meant),
+            where=Location(str(self._settings.port)),
             hint="Look at its plug, cable and power.",
         )
 
-    def _found(self) -> tuple[str, str]:
-        """The port's path now, and the adapter's serial number."""
+    def _adapter(self) -> str:
+        """The serial number of the port's USB adapter; empty if it has none."""
         from serial.tools import list_ports
 
-        text = self._settings.serial_number
-        if self._settings.port is not None:
-            path = str(self._settings.port)
-            actual = os.path.realpath(path)
-            numbers = [port.serial_number for port in list_ports.comports() if os.path.realpath(port.device) == actual]
-            return path, (numbers[0] or "") if numbers else ""
-        ports = list_ports.comports()
-        devices = [port.device for port in ports if port.serial_number == text]
-        if len(devices) == 1:
-            return str(devices[0]), str(text)
-        if not devices and self._was_open:
-            self._lose("no adapter with this serial number is plugged in")
-        seen = ", ".join(f"{port.device} ({port.serial_number})" for port in ports if port.serial_number)
-        raise DeviceRefusedError(
-            f"found {len(devices)} adapters with this serial number, expected one.",
-            where=Location(self._settings.meant),
-            hint=f"Plugged in are: {seen or 'none with a serial number'}.",
-        )
+        actual = os.path.realpath(self._settings.port)
+        return next((p.serial_number or "" for p in list_ports.comports() if os.path.realpath(p.device) == actual), "")
 
     def _refuse(self, path: str, fault: Exception) -> NoReturn:
         number = fault.errno if isinstance(fault, OSError) else None

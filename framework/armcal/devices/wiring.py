@@ -1,8 +1,7 @@
 """Whether each servo was seen to move the joint that its configuration names, since that configuration was changed.
 
-``armcal servo --check`` and ``armcal bus wiring`` write what they saw beside the file that names the servos: the servo
-file of boards that make pulses, the configuration of servos on a bus. ``armcal acquire`` drives no joint that is not
-there.
+``armcal servo --check`` writes what it saw beside the file that names the servos: the servo file of boards that make
+pulses, the configuration of servos on a bus. ``armcal acquire`` drives no joint that is not there.
 """
 
 from __future__ import annotations
@@ -23,10 +22,6 @@ from armcal.io.plain_files import write_whole
 
 _WRONG = ""
 """In the place of the fingerprint of a servo that did not do what was commanded."""
-_PULSES, _BUS = (
-    "check them with armcal servo CONFIG --check",
-    "check them with armcal servo CONFIG --check, or by hand with armcal bus wiring CONFIG",
-)
 
 
 @dataclass(frozen=True)
@@ -36,12 +31,10 @@ class WiringRecord:
     Attributes:
         stated_in: the file that names them; the record lies beside it.
         digests: by joint: a fingerprint (hex) of all that is stated of its servo.
-        mend: how they are checked.
     """
 
     stated_in: Path
     digests: Mapping[str, str]
-    mend: str
 
     @classmethod
     def of_servo_file(cls, path: Path, file: ServoFile | None = None) -> WiringRecord:
@@ -51,7 +44,7 @@ class WiringRecord:
             ConfigError: it is refused.
         """
         known = load_servo_file(path) if file is None else file
-        return cls(path, {joint: digest({joint: known.calibrated(joint)}) for joint in known.servos}, _PULSES)
+        return cls(path, {joint: digest({joint: known.calibrated(joint)}) for joint in known.servos})
 
     @classmethod
     def of_config(cls, source: ConfigSource, joints: Iterable[str]) -> WiringRecord:
@@ -61,7 +54,7 @@ class WiringRecord:
         parts = {key.rpartition(".")[2]: part for key, part in stated.items()} if isinstance(stated, dict) else {}
         is_real = _section(source).get("clock", "real") == "real"
         names = [joint.rpartition(".")[2] for joint in joints]
-        return cls(source.path, {name: _fingerprint([parts.get(name, device), is_real]) for name in names}, _BUS)
+        return cls(source.path, {name: _fingerprint([parts.get(name, device), is_real]) for name in names})
 
     @property
     def path(self) -> Path:
@@ -73,7 +66,7 @@ class WiringRecord:
         Args:
             right: the joints seen to turn.
             others: joints that were tried and did not, or cannot be distinguished from another one.
-            seen: ``adapter``, ``by`` (``tracker`` or ``somebody``) and ``at`` (unix s).
+            seen: ``adapter``, ``by`` (``tracker``) and ``at`` (unix s).
 
         Raises:
             InputError: it cannot be written.
@@ -120,8 +113,8 @@ class WiringRecord:
         raise InputError(
             f"found servos that were not checked to move their joint ({named}); nothing was moved.",
             where=Location(str(self.stated_in)),
-            hint=f"With exchanged plugs or ids the wrong joint moves: {self.mend}, or give --unchecked to drive them "
-            "without a check.",
+            hint="With exchanged plugs or ids the wrong joint moves: check them with armcal servo CONFIG --check, or "
+            "give --unchecked to drive them without a check.",
         )
 
     def _key(self, joint: str) -> str:

@@ -37,7 +37,7 @@ def rewritten(path: Path, **columns: object) -> None:
 
 
 def all_of(recording: Recording) -> list:
-    return list(recording.stretches())
+    return list(recording.stretches)
 
 
 @pytest.mark.parametrize("version", VERSIONS)

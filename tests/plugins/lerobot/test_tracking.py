@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pyarrow")
-from armcal.plugins import discover
-from armcal_lerobot.arm import Gripper
 from armcal_lerobot.recordings import Recording, open_recording
-from armcal_lerobot.tracking import Tracking, compared, error_at_rest, findings_of, trackings
+from armcal_lerobot.tracking import Tracking, findings_of, trackings
 
 from tests.plugins.lerobot.planted import MOTORS, Planted, episodes, write_dataset
 
-ARM = Path(__file__).parents[3] / "configs" / "so101" / "arm.yaml"
 PLANTED = {
     "shoulder_pan": Planted(offset=0.5),
     "shoulder_lift": Planted(offset=-2.0, gain=0.98, backlash=1.0, delay=0.15),
@@ -38,11 +35,6 @@ def by_motor(motion: Recording) -> Mapping[str, Tracking]:
 @pytest.fixture(scope="module")
 def planted_motion(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return motion_of(tmp_path_factory.mktemp("data") / "planted", episodes(PLANTED, count=5, frames=800))
-
-
-@pytest.fixture(scope="module")
-def gripper() -> Gripper:
-    return Gripper(ARM, None, MOTORS, [], discover())
 
 
 @pytest.mark.quick("elbow_flex")
@@ -84,23 +76,6 @@ def test_a_follower_that_lags_like_a_spring_and_damper_has_no_backlash(tmp_path:
     for t in by_motor(motion_of(tmp_path / "set", made)).values():
         assert t.backlash and t.delay_s
         assert abs(t.backlash.value) < 0.1 and 0.06 < t.delay_s < 0.14
-
-
-@pytest.mark.slow
-def test_sag_under_gravity_is_found_per_newton_metre(tmp_path: Path, gripper: Gripper) -> None:
-    made, compliance = [], {"shoulder_lift": 2.4, "elbow_flex": 3.9}
-    for action, _ in episodes({}, count=5, frames=800):
-        torques = gripper.torques(MOTORS, action)
-        state = action.copy()
-        for name, degrees in compliance.items():
-            state[:, MOTORS.index(name)] += degrees * torques[:, MOTORS.index(name)]
-        made.append((action, state))
-    document = compared(motion_of(tmp_path / "set", made), gripper)
-    motors = document.data["motors"]
-    for name, degrees in compliance.items():
-        assert motors[name]["load"]["value"] == pytest.approx(degrees, rel=0.05)
-    assert motors["shoulder_pan"]["load"] is None  # its axis is upright
-    assert any("shoulder_lift gives way to gravity by 2.4" in str(text) for text in document.summary)
 
 
 @pytest.mark.slow
@@ -156,14 +131,3 @@ def test_doubt_is_stated(tmp_path: Path) -> None:
 def test_one_short_episode_gives_doubt_and_no_number(tmp_path: Path) -> None:
     for t in by_motor(motion_of(tmp_path / "set", episodes(PLANTED, count=1, frames=40))).values():
         assert t.backlash is None and t.gain is None and t.doubts
-
-
-def test_mm_at_the_gripper(tmp_path: Path, gripper: Gripper) -> None:
-    """2 deg of the pan alone move the gripper by its distance from the pan's axis; a delay alone moves it nowhere."""
-    still = [(np.zeros((60, 6)), np.tile([2.0, 0, 0, 0, 0, 0], (60, 1)))]
-    standing = motion_of(tmp_path / "still", still)
-    at_rest = error_at_rest(standing, trackings(standing), gripper)
-    radius = float(np.linalg.norm(gripper.positions(np.zeros((5, 1)))[:2]))
-    assert at_rest and at_rest["typical_mm"] == pytest.approx(2000 * radius * np.sin(np.radians(1.0)), rel=1e-4)
-    late = motion_of(tmp_path / "late", episodes({}, count=4, frames=300))
-    assert (after := error_at_rest(late, trackings(late), gripper)) and after["typical_mm"] < 0.5

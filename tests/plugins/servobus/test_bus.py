@@ -7,8 +7,7 @@ import time
 
 import pytest
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal_servobus.bus import Bus, BusSettings
-from armcal_servobus.finding import find
+from armcal_servobus.bus import Bus, BusSettings, FoundServo, looked_at, present
 
 from tests.plugins.servobus.fake_bus import FakeBus, sts, xl430
 
@@ -18,6 +17,10 @@ def opened(fake: FakeBus, **settings: object) -> Bus:
     bus = Bus(BusSettings.model_validate({"port": fake.path, "protocol": protocol, **settings}), {1: "arm.q1"})
     bus.open()
     return bus
+
+
+def servos_on(bus: Bus, ids=range(31)) -> list[FoundServo]:
+    return [servo for servo in (looked_at(bus, number) for number in present(bus, ids)) if servo is not None]
 
 
 class Faulty:
@@ -44,7 +47,7 @@ def lost(answer: bytes) -> bytes:
 def test_reads_and_writes(protocol, servo, place, echoes):
     with FakeBus([servo(1, 100), servo(2, 300)], protocol, echoes) as fake:
         bus = opened(fake)
-        assert bus.ping(1) and bus.read(2, place, 2) == (300).to_bytes(2, "little")
+        assert present(bus, range(4)) == [1, 2] and bus.read(2, place, 2) == (300).to_bytes(2, "little")
         bus.write(1, 36, b"\x07")
         assert fake.servos[0].memory[36] == 7
         data = bus.read_all([2, 1], place, 2)
@@ -59,7 +62,7 @@ def test_a_ping_whose_echo_looks_like_an_answer_finds_nobody():
     """FF FF 01 02 01 FB is a ping of id 1, and the answer of a servo 1 that lacks voltage."""
     with FakeBus([sts(2)], echoes=True) as fake:
         bus = opened(fake, reply_ms=10)
-        assert bus.ping(2) and not bus.ping(1)
+        assert present(bus, range(4)) == [2]
         bus.close()
 
 
@@ -124,8 +127,8 @@ def test_all_servos_are_found():
     with FakeBus([sts(1, 10), sts(3, 30), sts(250, 40)]) as fake:
         bus = opened(fake)
         fake.servos[1].alarm = 0x20
-        found_servos = list(find(bus, (1_000_000,)))
-        assert [(s.id, s.model_name, s.firmware, s.position) for s in found_servos] == [
+        found_servos = servos_on(bus)
+        assert [(s.id, s.model and s.model.name, s.firmware, s.position) for s in found_servos] == [
             (1, "sts3215", "3.10", 10), (3, "sts3215", "3.10", 30), (250, "sts3215", "3.10", 40)
         ]  # fmt: skip
         assert found_servos[1].alarms == ("overload",) and found_servos[0].voltage == 12.1
@@ -145,7 +148,7 @@ def test_a_servo_whose_answer_was_lost_is_asked_again():
 
         fake.mangle = mangle
         bus = opened(fake)
-        assert [servo.id for servo in find(bus, (1_000_000,), range(4))] == [1, 2] and len(lost) == 2
+        assert [servo.id for servo in servos_on(bus, range(4))] == [1, 2] and len(lost) == 2
         bus.close()
 
 
@@ -155,7 +158,7 @@ def test_two_servos_with_one_id_are_seen(protocol):
     servo = xl430 if protocol == 2 else sts
     with FakeBus([servo(2), servo(3, 100), servo(3, 900)], protocol) as fake:
         bus = opened(fake, reply_ms=20)
-        doubled = {s.id: s.is_doubled for s in find(bus, (1_000_000,), range(5))}
+        doubled = {s.id: s.is_doubled for s in servos_on(bus, range(5))}
         assert doubled == {2: False, 3: True}
         bus.close()
 
@@ -176,6 +179,6 @@ def test_two_servos_that_talk_at_once_are_seen():
 
         bus = opened(fake, reply_ms=20)
         fake.mangle = collide
-        doubled = {s.id: s.is_doubled for s in find(bus, (1_000_000,), range(5))}
+        doubled = {s.id: s.is_doubled for s in servos_on(bus, range(5))}
         assert doubled == {2: False, 3: True}
         bus.close()

@@ -1,4 +1,4 @@
-"""``armcal bus`` on servos at the far end of a pty: find, check, home, wiring."""
+"""``armcal bus`` on servos at the far end of a pty: find, check, home."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from armcal.cli.main import cli
 from armcal.config.yaml_source import load_config
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
-from armcal_servobus.homing import held_at, planned, turned
+from armcal_servobus.command import Stated, planned
 from armcal_servobus.joints import ServoJointsSettings
 from click.testing import CliRunner, Result
 
@@ -96,8 +96,7 @@ def test_home_sets_offsets_and_restores_them(tmp_path, model):
         config = written(tmp_path, desk.path, model, protocol=protocol)
         desk.servos[0].motor._gear = desk.servos[0].motor.target = 0.2
         desk.servos[1].motor._gear = desk.servos[1].motor.target = -0.1
-        kept = tmp_path / "kept.json"
-        ran = called("home", config, "--at", "q2=30", "--keep", kept, "--yes", "--json")
+        ran = called("home", config, "--at", "q1=0", "--at", "q2=30", "--yes", "--json")
         offsets = json.loads(ran.stdout)["offsets"]
         assert offsets["q1"]["change_deg"] == pytest.approx(-math.degrees(0.2), abs=0.1)
         rows = json.loads(called("check", config, "--json").stdout)["joints"]
@@ -105,8 +104,8 @@ def test_home_sets_offsets_and_restores_them(tmp_path, model):
         assert desk.servos[0].get("homing_offset") == offsets["q1"]["after"] != 0
         desk.bus.boot()
         assert desk.servos[0].get("homing_offset") == offsets["q1"]["after"], "it is in the EEPROM"
-        assert json.loads(kept.read_text())["servos"]["q1"]["offset"] == 0
-        again = called("home", config, "--restore", kept, "--keep", tmp_path / "second.json", "--yes")
+        before = [f"--offset={joint}={changed['before']}" for joint, changed in offsets.items()]
+        again = called("home", config, *before, "--yes")
         assert again.exit_code == 0, again.output
         assert [servo.get("homing_offset") for servo in desk.servos] == [0, 0]
     finally:
@@ -118,16 +117,11 @@ def test_home_asks_and_writes_nothing_unasked(tmp_path):
         config = written(tmp_path, fake.path)
         assert "no terminal to ask at" in refusal(called("home", config))
         assert "JOINT=DEG" in refusal(called("home", config, "--at", "q1=x", "--yes"))
-        assert "found no joint q9" in refusal(called("home", config, "--joint", "q9", "--yes"))
+        assert "JOINT=COUNTS" in refusal(called("home", config, "--offset", "q1=1.5", "--yes"))
+        assert "found no joint q9" in refusal(called("home", config, "--at", "q9=0", "--yes"))
         fake.servos[0].memory[40] = 1
-        assert "q1 hold, expected servos without torque" in refusal(
-            called("home", config, "--yes", "--keep", tmp_path / "a.json")
-        )
+        assert "q1 hold, expected servos without torque" in refusal(called("home", config, "--yes"))
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
-        fake.servos[0].memory[40] = 0
-        (tmp_path / "b.json").write_text("{}")
-        assert "there already" in refusal(called("home", config, "--yes", "--keep", tmp_path / "b.json"))
-        assert "holds no offsets" in refusal(called("home", config, "--restore", tmp_path / "b.json", "--yes"))
 
 
 def joints_of(fake: FakeBus, model: str = "sts3215"):
@@ -150,50 +144,22 @@ def test_offsets_at_the_ends_of_the_register(tmp_path):
         for count, offset in ((1, -2047), (4095, 2047), (2049, 1)):
             fake.servos[0].memory[56:58] = count.to_bytes(2, "little")
             bus, joints = joints_of(fake)
-            assert planned(bus, joints, held_at({}))[0].after == offset
+            assert planned(bus, joints, Stated({}, {}, {}))[0].after == offset
             bus.close()
 
 
-def test_a_horn_that_is_a_tooth_off_is_named():
-    tooth = round(4096 / 25)
-    with FakeBus([sts(1, 2048 - tooth), sts(2, 2048 + 80)]) as fake:
-        bus, joints = joints_of(fake)
-        first, second = planned(bus, joints, held_at({}))
-        assert first.finding == "about 1 tooth of its horn (14.4 deg each): is it put on wrong?"
-        assert second.finding == ""
-        bus.close()
-
-
-def test_wiring_names_inverted_and_exchanged_joints(tmp_path):
-    with FakeBus([sts(1), sts(2)]) as fake:
-        bus, joints = joints_of(fake)
-        still = {"q1": 2048, "q2": 2048}
-        assert turned(joints, still, {"q1": 2300, "q2": 2040}, "q1") == ""
-        assert turned(joints, still, {"q1": 2048, "q2": 1800}, "q2") == ""
-        assert "inverted, set direction: 1" in turned(joints, still, {"q1": 2048, "q2": 2300}, "q2")
-        assert "ids may be exchanged (1 and 2)" in turned(joints, still, {"q1": 2048, "q2": 1800}, "q1")
-        assert "nothing turned" in turned(joints, still, still, "q1")
-        assert turned(joints, {"q1": 4000, "q2": 0}, {"q1": 200, "q2": 0}, "q1") == "", "over the seam"
-        bus.close()
-        config = written(tmp_path, fake.path)
-        ran = called("wiring", config, stdin="\n\n")
-        assert ran.exit_code == 2 and "q1: nothing turned" in ran.output
-        with pytest.raises(InputError, match=r"\(q1, q2: the last check did not find it right\).*armcal bus wiring"):
-            WiringRecord.of_config(load_config(config), ("q1", "q2")).check(("q1", "q2"))
-
-
-def test_what_was_checked_by_hand_lasts_until_offsets_are_written(tmp_path):
+def test_what_was_checked_lasts_until_offsets_are_written(tmp_path):
     with FakeBus([sts(1), sts(2)]) as fake:
         config = written(tmp_path, fake.path)
         source = load_config(config)
         checks = WiringRecord.of_config(source, ("arm.q1", "arm.q2"))
         with pytest.raises(InputError, match="never checked"):
             checks.check(("arm.q1",))
-        checks.note(("q1", "q2"), (), {"adapter": "", "by": "somebody", "at": 0.0})
+        checks.note(("q1", "q2"), (), {"adapter": "", "by": "tracker", "at": 0.0})
         checks.check(("arm.q1", "q2"))
         with pytest.raises(InputError, match="an adapter without an id"):
             checks.check(("q1",), "A1B2")
-        ran = called("home", config, "--joint", "q1", "--yes")
+        ran = called("home", config, "--at", "q1=0", "--yes")
         assert ran.exit_code == 0, ran.output
         checks.check(("q2",))
         with pytest.raises(InputError, match=r"\(q1: never checked\)"):

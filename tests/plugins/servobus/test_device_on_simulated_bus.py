@@ -11,13 +11,12 @@ import tty
 
 import pytest
 from armcal.devices.device import DeviceError
-from armcal_servobus.bus import Bus, BusSettings
+from armcal_servobus.bus import Bus, BusSettings, looked_at, present
 from armcal_servobus.device import ServoBusDevice
-from armcal_servobus.finding import find
 from servo_bus_parts import BusOnDesk
 
 JOINTS = ("q1", "q2")
-MODELS = ("sts3215", "xl430-w250", "xl330-m288", "ax12")
+MODELS = ("sts3215", "xl430-w250", "xl330-m288")
 
 
 class PtyDesk(BusOnDesk):
@@ -119,15 +118,16 @@ def test_a_joint_turns_no_faster_than_is_set(desk):
 @pytest.mark.quick("sts3215")
 def test_they_are_found(desk):
     protocol = desk.servos[0].table.protocol
-    bus = Bus(BusSettings.model_validate({"port": desk.path, "protocol": protocol, "reply_ms": 60}))
-    there = list(find(bus, (desk.baud,), range(4)))
-    assert [(servo.id, servo.model_name) for servo in there] == [
+    bus = Bus(BusSettings.model_validate({"port": desk.path, "baud": desk.baud, "protocol": protocol, "reply_ms": 60}))
+    bus.open()
+    there = [looked_at(bus, servo) for servo in present(bus, range(4))]
+    assert [(servo.id, servo.model and servo.model.name) for servo in there] == [
         (1, desk.servos[0].table.name),
         (2, desk.servos[1].table.name),
     ]
     assert not any(servo.is_doubled or servo.alarms for servo in there)
     desk.servos[1]._put("id", 1)
-    (both,) = find(bus, (desk.baud,), range(4))
+    (both,) = (looked_at(bus, servo) for servo in present(bus, range(4)))
     assert both.id == 1 and both.is_doubled
     bus.close()
 

@@ -22,17 +22,6 @@ def joint(**settings: object) -> ServoJoint:
     return made.chosen(["q1"])["q1"]
 
 
-@given(st.integers(-30_000, 30_000), st.sampled_from([1, -1]), st.integers(0, 4095))
-def test_an_encoder_goes_on_over_its_seam(turned, direction, zero):
-    """A joint that is turned by hand, count by count, in a servo of which 12 bits are seen."""
-    made = joint(zero_count=zero, direction=direction, range_deg=[-179, 179])
-    before = made.unwrapped(zero)
-    for true in range(zero, zero + turned, 500 if turned > 0 else -500):
-        before = made.unwrapped(true % 4096, before)
-        assert before == true
-    assert made.angle(before) == pytest.approx(direction * STEP * (before - zero))
-
-
 @given(st.integers(0, 4095), st.floats(-100, 100))
 def test_a_range_over_the_seam_is_read_whole(zero, degrees):
     made = joint(zero_count=zero)
@@ -76,8 +65,6 @@ def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
         check_offset(MODELS["sts3215"], -3000)
     with pytest.raises(ValueError, match=r"-1024 to 1024.*remount its horn by 26 deg or more"):
         check_offset(MODELS["xl430-w250"], 1320)
-    with pytest.raises(ValueError, match="has none"):
-        check_offset(MODELS["ax12"], 1)
 
 
 @pytest.mark.parametrize(
@@ -86,6 +73,7 @@ def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
         ({"offset": 2500}, "remount it by 3 teeth"),
         ({"model": "sts9999"}, "expected one of sts3215"),
         ({"range_deg": [10, -10]}, "does not rise"),
+        ({"range_deg": [-200, 200]}, "wider than a turn"),
         ({"model": "xl430-w250"}, "set protocol: dynamixel2"),
         ({"id": 253}, "less than or equal to 252"),
         ({"direction": 0}, "1 or -1"),

@@ -3,36 +3,30 @@
 from __future__ import annotations
 
 import pytest
-from armcal_servobus.bus import FRAMINGS, Instruction, checksum, crc16
-from armcal_servobus.models import MODELS, Register
+from armcal_servobus.bus import FRAMINGS, Instruction
+from armcal_servobus.models import MAPS, Register
 from hypothesis import given
 from hypothesis import strategies as st
 
-SECOND = FRAMINGS["dynamixel2"]
+FEETECH, SECOND = FRAMINGS["feetech"], FRAMINGS["dynamixel2"]
 PUBLISHED = {
     # Dynamixel protocol 2.0: ping of id 1; ping of all; read of the present position (132, 4 bytes) of id 1;
-    # write of the goal position (116) 512 to id 1; sync read of positions of ids 1 and 2; reboot of id 1.
+    # write of the goal position (116) 512 to id 1; sync read of positions of ids 1 and 2.
     "ping": (SECOND.encoded(1, Instruction.PING), "FF FF FD 00 01 03 00 01 19 4E"),
     "ping all": (SECOND.encoded(0xFE, Instruction.PING), "FF FF FD 00 FE 03 00 01 31 42"),
-    "read": (SECOND.encoded(1, Instruction.READ, SECOND.place(132, 4)), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
+    "read": (SECOND.encoded(1, Instruction.READ, SECOND.numbers(132, 4)), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
     "write": (
-        SECOND.encoded(1, Instruction.WRITE, SECOND.address(116) + (512).to_bytes(4, "little")),
+        SECOND.encoded(1, Instruction.WRITE, SECOND.numbers(116) + (512).to_bytes(4, "little")),
         "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89",
     ),
     "sync read": (
-        SECOND.encoded(0xFE, Instruction.SYNC_READ, SECOND.place(132, 4) + bytes((1, 2))),
+        SECOND.encoded(0xFE, Instruction.SYNC_READ, SECOND.numbers(132, 4) + bytes((1, 2))),
         "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA",
     ),
-    "reboot": (SECOND.encoded(1, Instruction.REBOOT), "FF FF FD 00 01 03 00 08 2F 4E"),
-    # Dynamixel protocol 1.0: ping of id 1; read of the temperature (43) of id 1.
-    "old ping": (FRAMINGS["dynamixel1"].encoded(1, Instruction.PING), "FF FF 01 02 01 FB"),
-    "old read": (
-        FRAMINGS["dynamixel1"].encoded(1, Instruction.READ, FRAMINGS["dynamixel1"].place(43, 1)),
-        "FF FF 01 04 02 2B 01 CC",
-    ),
-    # Feetech's SCS protocol: read of the present position (56, 2 bytes) of id 1.
+    # Feetech's protocol, whose ping is that of Dynamixel's first: ping of id 1; read of its position (56, 2 bytes).
+    "feetech ping": (FEETECH.encoded(1, Instruction.PING), "FF FF 01 02 01 FB"),
     "feetech read": (
-        FRAMINGS["feetech"].encoded(1, Instruction.READ, FRAMINGS["feetech"].place(56, 2)),
+        FEETECH.encoded(1, Instruction.READ, FEETECH.numbers(56, 2)),
         "FF FF 01 04 02 38 02 BE",
     ),
 }
@@ -49,28 +43,28 @@ def test_answers_are_read_as_published():
     assert (ping.id, ping.alarm, ping.refusal) == (1, 0, "") and ping.data == bytes((6, 4, 38))
     (read,) = SECOND.received(bytes.fromhex("FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0")).answers
     assert int.from_bytes(read.data, "little") == 166
-    (old,) = FRAMINGS["dynamixel1"].received(bytes.fromhex("FF FF 01 03 00 20 DB")).answers
+    (old,) = FEETECH.received(bytes.fromhex("FF FF 01 03 00 20 DB")).answers
     assert old.data == bytes((32,))
 
 
 def test_what_a_servo_says_is_wrong_with_it_and_with_what_it_was_asked():
-    body = bytes((1, 2, 0x24 | 0x40))
-    (old,) = FRAMINGS["dynamixel1"].received(b"\xff\xff" + body + bytes((checksum(body),))).answers
-    assert MODELS["ax12"].words(old.alarm) == ("overheating", "overload") and "instruction" in old.refusal
+    body = b"\xff\xff" + bytes((1, 2, 0x24))
+    (old,) = FEETECH.received(body + FEETECH.check(body)).answers
+    assert MAPS["feetech"].words(old.alarm) == ("overheating", "overload") and not old.refusal
     packet = b"\xff\xff\xfd\0\x01\x04\0\x55\x87"
-    (new,) = SECOND.received(packet + crc16(packet).to_bytes(2, "little")).answers
+    (new,) = SECOND.received(packet + SECOND.check(packet)).answers
     assert new.alarm and "read-only" in new.refusal
-    assert MODELS["sts3215"].words(0x21) == ("voltage", "overload")
-    assert MODELS["sts3215"].words(0x40) == ("alarm 0x40",)
+    assert MAPS["feetech"].words(0x21) == ("voltage", "overload")
+    assert MAPS["feetech"].words(0x40) == ("alarm 0x40",)
 
 
 def answer(protocol: str, servo: int, data: bytes) -> bytes:
     if protocol == "dynamixel2":
         body = (b"\x55\0" + data).replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
         packet = b"\xff\xff\xfd\0" + bytes((servo,)) + (len(body) + 2).to_bytes(2, "little") + body
-        return packet + crc16(packet).to_bytes(2, "little")
-    body = bytes((servo, len(data) + 2, 0)) + data
-    return b"\xff\xff" + body + bytes((checksum(body),))
+        return packet + SECOND.check(packet)
+    packet = b"\xff\xff" + bytes((servo, len(data) + 2, 0)) + data
+    return packet + FEETECH.check(packet)
 
 
 PROTOCOLS = st.sampled_from(sorted(FRAMINGS))
@@ -112,22 +106,22 @@ def test_good_answers_are_found_between_damaged_ones():
 
 @given(st.integers(-2047, 2047))
 def test_sign_and_magnitude(value):
-    offset = MODELS["sts3215"].registers["offset"]
-    packed = offset.pack(value, "little")
-    assert offset.unpack(packed, "little") == value
+    offset = MAPS["feetech"].registers["offset"]
+    packed = offset.pack(value)
+    assert offset.unpack(packed) == value
     assert int.from_bytes(packed, "little") == (abs(value) | (0x800 if value < 0 else 0))
 
 
 @pytest.mark.parametrize(
     ("register", "value"),
-    [(MODELS["sts3215"].registers["offset"], 2048), (MODELS["sts3215"].registers["offset"], -2048), (Register(0), 256),
-     (Register(0, 2), -1), (MODELS["xl430-w250"].registers["goal"], 1 << 31)],
-)  # fmt: skip
+    [
+        (MAPS["feetech"].registers["offset"], 2048),
+        (MAPS["feetech"].registers["offset"], -2048),
+        (Register(0), 256),
+        (Register(0, 2), -1),
+        (MAPS["dynamixel2"].registers["goal"], 1 << 31),
+    ],
+)
 def test_what_does_not_fit_a_register_is_refused(register, value):
     with pytest.raises(ValueError, match="expected"):
-        register.pack(value, "little")
-
-
-def test_an_scs_servo_has_the_upper_byte_first():
-    assert MODELS["scs0009"].pack("goal", 0x0123) == b"\x01\x23"
-    assert MODELS["sts3215"].pack("goal", 0x0123) == b"\x23\x01"
+        register.pack(value)

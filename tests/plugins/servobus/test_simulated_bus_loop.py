@@ -48,7 +48,7 @@ class Loop:
 
     Attributes:
         ids: baud, id and model of what answered on the bus.
-        unchecked: what ``acquire`` said before any check, after ``bus wiring``, and after ``bus home``.
+        unchecked: what ``acquire`` said before any check, after ``servo --check``, and after ``bus home``.
         state: the bench's truth at the end.
         offsets: by joint, how ``bus home`` and ``lerobot zeros`` changed its homing offset (counts).
     """
@@ -86,25 +86,6 @@ class Terminal:
         assert done.returncode == code, f"{words}: {done.stdout}\n{done.stderr}"
         return done.stdout if code == 0 else " ".join(done.stderr.split())
 
-    def wiring(self, config: Path, clock: SimulatedClock) -> None:
-        """``bus wiring``: each joint is turned by hand when its line asks for that, and turned back later."""
-        words, pipe = self.words("bus", "wiring", config), subprocess.PIPE
-        angles = {joint: at["shaft_rad"] for joint, at in clock.ask({"state": True})["bus"].items()}
-        asked = subprocess.Popen(words, stdin=pipe, stderr=pipe, stdout=subprocess.DEVNULL, text=True)
-        assert asked.stdin is not None and asked.stderr is not None
-        for joint, angle in angles.items():
-            assert asked.stderr.readline().startswith(f"Turn {joint} by 15 deg")
-            put(clock, joint, angle + math.radians(20))
-            asked.stdin.write("\n")
-            asked.stdin.flush()
-        assert asked.wait(60) == 0
-        for joint, angle in angles.items():
-            put(clock, joint, angle)
-
-
-def put(clock: SimulatedClock, joint: str, angle: float) -> None:
-    clock.ask({"fault": {"kind": "put", "joint": joint, "angle": angle}})
-
 
 @pytest.fixture(scope="module")
 def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
@@ -131,9 +112,8 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
         ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]
         bench("bus", "check", config)
         unchecked = [acquire("plan.csv", "refused", code=2)]
-        bench.wiring(config, clock)
-        unchecked.append(doubt())
         bench("servo", config, "--check", "--yes")
+        unchecked.append(doubt())
         acquire("plan.csv", "runs")
         acquire("fresh.csv", "again")
         desk("run", config, "--data", folder / "runs" / "dataset.csv", "--out", folder / "calibrated")
@@ -207,9 +187,9 @@ def test_the_gripper_is_where_it_is_predicted_on_fresh_poses(loop: Loop) -> None
 
 
 def test_no_arm_was_driven_whose_wiring_was_not_checked(loop: Loop) -> None:
-    before, by_hand, homed = loop.unchecked
-    assert "never checked" in before and "armcal bus wiring" in before
-    assert by_hand == "" and "never checked" in homed
+    before, checked, homed = loop.unchecked
+    assert "never checked" in before and "armcal servo CONFIG --check" in before
+    assert checked == "" and "never checked" in homed
 
 
 def test_the_zeros_are_in_the_servos_afterwards(loop: Loop) -> None:
