@@ -99,7 +99,7 @@ class ServoRun:
     def pulses(self) -> dict[str, np.ndarray]:
         """Those found (us), by joint."""
         outcome = evaluated(self.setup(), self.out)
-        return {joint: 1e6 * np.array(servo.pulses) for joint, servo in outcome.fit.servos.items()}
+        return {joint: 1e6 * np.array(servo.pulses) for joint, servo in outcome.servos.items()}
 
     def entries(self, kind: str) -> list[Any]:
         """Of the record, of a kind."""

@@ -11,20 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.arm.assembly import Arm
 from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
+from armcal.base.poses import NO_TURN
 from armcal.devices.device import MeasuringDevice, measured_angles, open_device
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import ConfigError
 from armcal.io.journal import KeptJournal
 from armcal.run.experiment import Experiment
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.preparation import Prepared, prepare, run_limits
 from armcal_bench.acquisition.run_log import measured_by, progress_of
 from armcal_bench.bench import SECTION, Bench, closing
-from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.servo.rigid_arm import RigidArm
+from armcal_bench.servo.sighting import BODY, TABLES, Body, BodyFit, By, Corrections, Seen
 from armcal_bench.servo.trial import Move, Verdict, judged, noted
 from armcal_bench.settling import pose_of
 
@@ -169,7 +170,7 @@ def _judged(
     experiment: Experiment, joints: list[str], commanded: Mapping[str, Array], measured: Mapping[str, Array]
 ) -> JointCheck:
     bench = Bench.of(experiment)
-    nominal = NominalArm.of(bench.arm, experiment.parameters, experiment.system.environment)
+    nominal = RigidArm(bench.arm, experiment.parameters)
     base = dict(zip(joints, commanded[_BASE].tolist(), strict=True))
     seen = [joint for joint in joints if joint in measured and _BASE in measured]
     moves = [
@@ -185,7 +186,7 @@ def _judged(
         scope, stated = measured_by(experiment)[0], experiment.parameters
         axes = [f"{scope}.target_{axis}" for axis in "xyz"]
         target = np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in axes])
-        zeros = _zeros(nominal, joints, poses, target)
+        zeros = _zeros(experiment, bench.arm, joints, poses, target)
         # a zero that is far off turns the axes of the joints after it away from the model's
         verdicts = _verdicts(moves, {joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
     for joint in joints:
@@ -195,12 +196,14 @@ def _judged(
     return JointCheck(verdicts, zeros if all(verdict.kind == "right" for verdict in verdicts) else {})
 
 
-def _verdicts(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> list[Verdict]:
+def _verdicts(moves: Sequence[Move], base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
     verdicts = judged(moves, base, nominal) if moves else []
     return [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
 
 
-def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], target: Array) -> dict[str, Zero]:
+def _zeros(
+    experiment: Experiment, arm: Arm, joints: list[str], poses: tuple[Array, Array], target: Array
+) -> dict[str, Zero]:
     """How much the joints' angles are to be enlarged by.
 
     Args:
@@ -208,24 +211,20 @@ def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], t
         target: as stated (3, m, tool frame).
     """
     commanded, measured = poses
-    count, turned = len(joints), not np.isnan(measured[:, :3, :3]).any()
-
-    def residuals(x: Array) -> Array:
-        angles = commanded + x[:count]
-        tools = nominal.tools([dict(zip(joints, row, strict=True)) for row in angles.tolist()])
-        parts = [(tools[:, :3, :3] @ x[count:] + tools[:, :3, 3] - measured[:, :3, 3]).ravel()]
-        if turned:
-            off = Rotation.from_matrix(tools[:, :3, :3].transpose(0, 2, 1) @ measured[:, :3, :3]).as_rotvec()
-            parts.append(_LEVER_M * off.ravel())
-        return np.concatenate(
-            [*(p / _MODEL_SD_M for p in parts), x[:count] / _ZERO_SD, (x[count:] - target) / _TARGET_SD_M]
-        )
-
-    start = np.concatenate([np.zeros(count), target])
-    fit = least_squares(residuals, start, x_scale=0.1)
-    jacobian = np.asarray(fit.jac)
-    sds = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))  # the priors keep it regular
-    return {joint: Zero(float(fit.x[i]), float(sds[i])) for i, joint in enumerate(joints)}
+    numbers = {joint: arm.joint_names.index(joint) + 1 for joint in joints}
+    names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers.values()]
+    places = [f"{BODY}.seat_{axis}" for axis in "xyz"]
+    free = {**dict.fromkeys(names, _ZERO_SD), **dict.fromkeys(places, _TARGET_SD_M)}
+    by: By = "position" if np.isnan(measured[:, :3, :3]).any() else "pose"
+    count = len(measured)
+    angles = dict(zip(joints, commanded.T, strict=True))
+    turns, lengths = np.full(count, _MODEL_SD_M / _LEVER_M), np.full(count, _MODEL_SD_M)
+    seen = Seen(angles, measured, turns, place_noise=lengths)
+    body = Body((arm.name,), by, NO_TURN, tuple(target.tolist()))
+    fit = BodyFit(experiment, arm, Corrections({}, list(numbers.values()), ()), body, free, seen)
+    fit.fit(seen, np.ones(count))
+    sds = fit.deviations(names).tolist()
+    return {joint: Zero(fit.value(name), sd) for joint, name, sd in zip(joints, names, sds, strict=True)}
 
 
 def _written(path: Path, joints: list[str], poses: Mapping[str, Sequence[float] | Array]) -> Path:

@@ -59,7 +59,12 @@ def sags(joint: str, speeds: tuple[float, ...]) -> list[Planted]:
     """A horn that slips, in deg/min for each N m; the slowest is below what stands of a second show."""
     key = f"bench.simulator.joints.{joint}.creep_deg_per_min"
     named = [
-        Planted(f"{joint} slips {s:g} deg/min/N m", f"{joint}.* sinks by", settings=((key, s),)) for s in speeds[:-1]
+        Planted(
+            f"{joint} slips {s:g} deg/min/N m",
+            "the target moves by .* while the arm should stand",
+            settings=((key, s),),
+        )
+        for s in speeds[:-1]
     ]
     return [*named, Planted(f"{joint} slips {speeds[-1]:g} deg/min/N m", "", settings=((key, speeds[-1]),))]
 

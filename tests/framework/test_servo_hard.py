@@ -370,7 +370,7 @@ class TestTables:
         hertz = 1.01 * stated
         boards = {"front": BoardSettings.si(**{**setup.file.boards["front"].model_dump(), "oscillator_hz": hertz})}
         later = improved(ServoFile(boards, setup.file.servos), fitted)
-        for joint, servo in fitted.fit.servos.items():
+        for joint, servo in fitted.servos.items():
             ticks = np.array(later.servos[joint].pulses) * hertz
             assert ticks == pytest.approx(np.array(servo.pulses) * stated, abs=0.03)
 

@@ -1,7 +1,6 @@
 """A plan made ready to be driven: every pose checked before anything moves."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,8 @@ from armcal.run.plan import approach_channels
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
 from armcal_bench.acquisition.drive import PathPlanner
+from armcal_bench.acquisition.evidence import Arrival
 from armcal_bench.acquisition.heat import HeatModel, holding_torques
-from armcal_bench.acquisition.sag import Arrival, SagJudge
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.bench import Bench
@@ -38,7 +37,6 @@ class Prepared:
     plan: Dataset  # joint commands and the plan's ids, in its order
     scheduler: Scheduler  # over the angles that the device can set nearest to them; with the planner and the heat model
     arrival: Arrival  # whether the arm stands where it was commanded to
-    sag: SagJudge  # names a joint that gives way
     judge: HazardJudge  # of what is dangerous in the first motions and the last
     warnings: tuple[str, ...]  # of limits beyond the arm model's own
 
@@ -85,10 +83,9 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     )
     judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
-    sag = SagJudge(device.joint_names, partial(nominal_tools, arm), heat.torques)
     planned = experiment.settings.plan.limits if experiment.settings.plan else {}
     warnings = stated_beyond(experiment, {**planned, **settings.limits})
-    return Prepared(bench, device, commands, scheduler, arrival, sag, judge, warnings)
+    return Prepared(bench, device, commands, scheduler, arrival, judge, warnings)
 
 
 def _check_measures(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice) -> None:

@@ -19,6 +19,7 @@ from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.evidence import Drift, Evidence, FrameRefused, JointGivesWay
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.recovery import DeviceLost, Recovery
@@ -32,7 +33,6 @@ from armcal_bench.acquisition.run_log import (
     write_measured,
     write_outputs,
 )
-from armcal_bench.acquisition.sag import Arrival, Sag, SagJudge
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.acquisition.tracker_monitor import (
     MotionGate,
@@ -45,79 +45,7 @@ from armcal_bench.acquisition.tracker_monitor import (
 from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
-from armcal_bench.settling import Settled, Stand, pose_of
-
-
-class FrameRefused(StopRequested):
-    """The tracker's units or handedness are not those that are expected."""
-
-
-class JointGivesWay(StopRequested):
-    """A joint moves while the arm should stand, pose after pose."""
-
-
-class Evidence:
-    """Everything that was seen, of poses that count as measured and of others.
-
-    Args:
-        poses: commanded, by index (N x joints, rad).
-        arrival: compares poses with the model's.
-        sag: names a joint that gives way.
-
-    Attributes:
-        doubted: what was recorded of poses that do not count as measured, by their index.
-    """
-
-    def __init__(self, poses: Array, arrival: Arrival, sag: SagJudge) -> None:
-        self.doubted: dict[int, Mapping[str, Any]] = {}
-        self.arrival, self._poses, self._sag = arrival, poses, sag
-        self._stands: list[tuple[int, Stand]] = []
-        self._failed = 0
-
-    def stood(self, pose: int, stand: Stand | None) -> None:
-        """How the target moved while the arm should stand in a pose; None where it was hardly seen."""
-        if stand is not None:
-            self._stands.append((pose, stand))
-
-    def succeeded(self, pose: int) -> None:
-        self._failed = 0
-        self.doubted.pop(pose, None)
-
-    def failed(self, measured: Mapping[int, Array]) -> None:
-        """The arm did not come to stand in a pose, or stood elsewhere.
-
-        Args:
-            measured: ``base_T_target`` (4 x 4, m) of measured poses, by their index.
-
-        Raises:
-            JointGivesWay: that happened several times in a row, and a joint is the reason.
-        """
-        self._failed += 1
-        sag = self.gives_way(measured, self._failed) if self._failed >= self.arrival.settings.in_a_row else None
-        if sag is not None and sag.joints:
-            raise JointGivesWay(f"{sag.sentence}. {sag.mend}".rstrip("."))
-
-    def gives_way(self, measured: Mapping[int, Array], last: int = 0) -> Sag | None:
-        """A joint that gives way, by the last so many stands, or all of them. See ``failed``."""
-        stands = self._stands[-last:]
-        if not stands:
-            return None
-        seen = np.array(list(measured.values())).reshape(-1, 4, 4)
-        angles = self._poses[[pose for pose, _ in stands]]
-        return self._sag.sag_of(angles, [stand for _, stand in stands], (self._poses[list(measured)], seen))
-
-    def check_frame(self, measured: Mapping[int, Array]) -> None:
-        """Refuse other units or another frame than expected, by everything that was seen. See ``failed``.
-
-        Raises:
-            FrameRefused: they are others.
-        """
-        glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
-        doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
-        if (mistake := self.arrival.mistake({**glimpsed, **measured, **doubted})) is not None:
-            kept = "The poses that were measured are kept as they came"
-            raise FrameRefused(f"{mistake.sentence}. {mistake.mend} {kept}")
-
+from armcal_bench.settling import Settled, pose_of
 
 T = TypeVar("T")
 _TRIES = 2
@@ -142,7 +70,7 @@ class AcquisitionRun:
         scheduler: decides what comes next.
         gate: asked between two steps of the arm.
         log: the journal, in which every step is written as it is made.
-        evidence: of what is wrong with the tracker's frame, or with a joint.
+        evidence: of what is wrong with the tracker's frame, or with the arm.
         on_progress: called after each pose.
     """
 
@@ -247,7 +175,7 @@ class AcquisitionRun:
         if isinstance(settled, str):
             self._try_later(step.pose, settled)
             self._check_frame()
-            self._evidence.failed(self.known)
+            self._evidence.failed()
         else:
             self._accept(step.pose, settled)
 
@@ -295,7 +223,7 @@ class AcquisitionRun:
         if doubt:
             self._astray += 1
             self._try_later(pose, doubt)
-            self._evidence.failed(self.known)
+            self._evidence.failed()
             if self._astray >= self._settings.arrival.in_a_row:
                 raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
@@ -423,7 +351,7 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         progress, identity = log.progress, log.identity
         _check_frame(prepared, progress, options.folder)
         is_done = {*progress.measured, *progress.left_out} >= set(prepared.scheduler.ids)
-        sag: Sag | None = None
+        drift: Drift | None = None
         if identity is not None and is_done and progress.ended in ("done", "parked", "failed"):
             how, why = progress.at_the_end(len(prepared.scheduler.ids))  # nothing needs to be there
             ending = Ending(how, "it was done before" if how == "done" else why)
@@ -431,9 +359,9 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
             try:
                 with _opened(prepared, options, clock, log) as (gate, identity):
                     log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-                    evidence = Evidence(prepared.scheduler.poses, prepared.arrival, prepared.sag)
+                    evidence = Evidence(prepared.arrival)
                     run = _prepared_run(prepared, options, log, gate, identity, evidence)
-                    ending, progress, sag = run.run(), log.progress, evidence.gives_way(run.known)
+                    ending, progress, drift = run.run(), log.progress, evidence.drift()
             except (Exception, SystemExit):
                 if identity is not None:
                     with suppress(Exception):  # the journal holds it, whatever else is broken
@@ -441,7 +369,7 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
                 raise
         summary = {
             **_summary(prepared, ending, progress),
-            "gives_way": None if sag is None else sag.content,
+            "gives_way": None if drift is None else drift.content,
             "board": identity.name,
             "digests": _digests(identity, header),
         }

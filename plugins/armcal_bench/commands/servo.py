@@ -24,7 +24,7 @@ from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.commands.acquire import driven
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.joint_check import check_joints
-from armcal_bench.keys import wishes_from
+from armcal_bench.keys import servo_input
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
 from armcal_bench.servo.setup import Setup
@@ -66,7 +66,7 @@ def servo(
             may_energise=warned(console, may_energise),
             report=lambda joint, done, planned: show(f"measuring {joint}", done / max(planned, 1)),
             say=partial(say, err=console.json),
-            wishes=lambda: wishes_from(0),
+            wishes=lambda: servo_input(0),
             waits=waits(console),
         )
         if check:
@@ -97,7 +97,7 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
         before.carry_over(after)
     names = {"servo_file": str(setup.path), "before": None if earlier is None else str(earlier)}
     console.show(_document(content, setup.joints), **names)
-    console.detail(f"{len(outcome.task.observations)} angles, in {JOURNAL}.")
+    console.detail(f"{sum(s.used + len(s.outliers) for s in outcome.servos.values())} angles, in {JOURNAL}.")
     if earlier is not None:
         console.line(f"{setup.path}: written; the one before is {earlier.name}")
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]

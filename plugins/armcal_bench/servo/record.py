@@ -19,8 +19,8 @@ from armcal.io.journal import JOURNAL, Entry, Journal, KeptJournal, has_journal
 from armcal.io.plain_files import writing
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from armcal_bench.servo.problem import KnownBoard, KnownServo
 from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.tables import KnownBoard, KnownServo
 
 _LINES_BEFORE = "observations.jsonl"  # what versions before had in the journal's place
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of entries

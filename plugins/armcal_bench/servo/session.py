@@ -20,11 +20,12 @@ from armcal_bench.acquisition.recovery import DeviceLost
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested, TrackerLost, TrackerMonitor, Waits
 from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
-from armcal_bench.keys import QUIT, Wishes
+from armcal_bench.keys import QUIT, OperatorInput
 from armcal_bench.measured_frame import FEWEST, FrameMistake, frame_mistake
-from armcal_bench.servo.outcome import Outcome, outcome_of
+from armcal_bench.servo.fit import outcome_of
 from armcal_bench.servo.record import ANGLE, LEFT_OUT, POSE, Record, begin, check_same, stated_by
 from armcal_bench.servo.setup import Mover, ServoDevice, Setup
+from armcal_bench.servo.tables import Outcome
 from armcal_bench.servo.trial import Move, Verdict, answered, judged, noted, wrapped
 from armcal_bench.settling import Settled
 
@@ -217,7 +218,7 @@ class Guided:
     """A calibration by eye. What is in the record is not asked for again."""
 
     mover: Mover
-    wishes: Wishes
+    wishes: OperatorInput
     record: Record
     say: Callable[[str], None]
 
@@ -306,18 +307,19 @@ class Guided:
         return min(max(counts, math.ceil(low / tick)), math.floor(high / tick))
 
 
-def next_wish(wishes: Wishes, mover: Mover) -> str:
+def next_wish(wishes: OperatorInput, mover: Mover) -> str:
     """What somebody wishes next; the arm holds until then.
 
     Raises:
         StopRequested: it is the end.
     """
     while True:
-        wish = wishes.next(_LOOK_S)
-        if wish == QUIT or mover.gate.asked_to_end():
+        word = wishes.next(_LOOK_S)
+        word = word and word.strip().lower()
+        if word == QUIT or mover.gate.asked_to_end():
             raise StopRequested("it was asked to stop")
-        if wish is not None:
-            return wish
+        if word:
+            return word
         mover.device.keep_alive()
 
 
@@ -337,7 +339,9 @@ class Conversation:
     may_energise: Callable[[FirstMotion], bool]
     report: ReportProgress  # takes how far a tracked calibration is
     say: Callable[[str], None]  # takes a line, of a guided one
-    wishes: Callable[[], AbstractContextManager[Wishes]]  # what somebody presses or writes, while it is asked for
+    wishes: Callable[
+        [], AbstractContextManager[OperatorInput]
+    ]  # what somebody presses or writes, while it is asked for
     waits: Waits = field(default_factory=Waits)  # says what is waited for
 
 
@@ -375,7 +379,7 @@ def evaluated(setup: Setup, folder: Path) -> Outcome:
     if record.begun is None:
         raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
     servos, boards = stated_by(setup, record.begun, setup.joints)
-    return outcome_of(record.entries, servos, boards, setup.nominal, setup.settings)
+    return outcome_of(record.entries, servos, boards, setup.bench.experiment, setup.bench.arm, setup.settings)
 
 
 def adapter_of(folder: Path) -> str:
@@ -521,7 +525,7 @@ def _check_frame(frame: FrameWatch, verdicts: Sequence[Verdict]) -> None:
     raise InputError(f"{mistake.sentence}.", hint=f"{mistake.mend} {other}".rstrip())
 
 
-def _by_eye(mover: Mover, joint: str, talk: Conversation, wishes: Wishes) -> Verdict:
+def _by_eye(mover: Mover, joint: str, talk: Conversation, wishes: OperatorInput) -> Verdict:
     turn, at = _small_turn(mover.setup, joint), mover.counts[joint]
     mover.go(joint, mover.counts_at(joint, mover.setup.base[joint] + turn))
 

@@ -35,8 +35,8 @@ from armcal_bench.acquisition.recovery import Recovery
 from armcal_bench.acquisition.tracker_monitor import MotionGate
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.hazards import HazardJudge
-from armcal_bench.servo.nominal import NominalArm
-from armcal_bench.servo.problem import KnownBoard, KnownServo, MeasuredPulse
+from armcal_bench.servo.rigid_arm import RigidArm
+from armcal_bench.servo.tables import KnownBoard, KnownServo, MeasuredPulse
 
 PositiveAngle = Annotated[Angle, Field(gt=0)]
 PositiveDuration = Annotated[Duration, Field(gt=0)]
@@ -120,7 +120,7 @@ class Setup:
     joints: tuple[str, ...]  # those to calibrate
     base: Mapping[str, float]  # where every servo's joint stands while others are measured (rad)
     ranges: Mapping[str, tuple[float, float]]  # over which each joint may be moved from there (rad)
-    nominal: NominalArm  # the arm by its model
+    nominal: RigidArm  # the arm by its model
     heat: HeatModel  # of the servos
     planner: PathPlanner  # of straight ways on which nothing comes too near, if that is stated
     judge: HazardJudge  # of what is dangerous in the first motions
@@ -153,7 +153,7 @@ class Setup:
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
         limits = dict(zip(arm.commanded, run_limits(experiment, acquisition, arm).tolist(), strict=True))
-        nominal = NominalArm.of(arm, experiment.parameters, experiment.system.environment)
+        nominal = RigidArm(arm, experiment.parameters)
         heat = heat_of(experiment, bench.settings.acquisition, arm)
         ends = np.array(list(limits.values()))
         planner = PathPlanner(clearance_of(experiment, arm), ends, np.zeros((0, len(limits))), _LOOK_STEP)
