@@ -19,8 +19,8 @@ from armcal.io.journal import JOURNAL, Journal
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.rehearsal import overrides_for
 from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import Conversation, evaluated, measure
-from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.session import evaluated, measure
+from armcal_bench.servo.setup import Conversation, Setup
 
 from tests.bench_runs import BenchRun, _in_child, _wait, free_port
 from tests.servo_fakes import CONFIGS

@@ -104,12 +104,12 @@ class TestAJointThatGivesWay:
 
     @pytest.mark.slow
     def test_it_is_said_at_the_end_where_it_is_too_slow_to_keep_poses_from_settling(self, tmp_path: Path) -> None:
-        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 10})
+        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 40})
         with arm.run.simulated():
             code, said = acquired(arm)
         assert code == 3 and re.search(r"done: .*warning: the target moves by \d+ mm/min while", said)
         gives_way = json.loads((arm.out / "summary.json").read_text())["gives_way"]
-        assert gives_way["poses"] >= 3 and 5 < gives_way["mm_per_min"] < 30
+        assert gives_way["poses"] >= 3 and 20 < gives_way["mm_per_min"] < 120
 
     @pytest.mark.slow
     def test_nothing_is_said_where_none_does(self, tmp_path: Path) -> None:

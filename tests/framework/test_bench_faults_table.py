@@ -71,7 +71,7 @@ def sags(joint: str, speeds: tuple[float, ...]) -> list[Planted]:
 
 CASES = [
     (kind, planted)
-    for kind, joint, speeds in ((TOWER, "lift", (300.0, 60.0, 10.0, 0.3)), (POST, "b", (600.0, 150.0, 30.0, 1.0)))
+    for kind, joint, speeds in ((TOWER, "lift", (300.0, 60.0, 0.3)), (POST, "b", (600.0, 150.0, 1.0)))
     for planted in (*wiring(kind), *tracker(), *sags(joint, speeds))
 ]
 

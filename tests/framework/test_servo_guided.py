@@ -10,19 +10,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal.errors import DataError, InputError
+from armcal.errors import InputError
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.keys import QUIT, OperatorInput, servo_input
 from armcal_bench.servo.outputs import improved
 from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import Conversation, evaluated, measure
+from armcal_bench.servo.session import evaluated, measure
+from armcal_bench.servo.setup import Conversation
 
 from tests.servo_fakes import config_in, setup_on
 
 SERVO = "bench:\n  servo: {joints: [q1, q3], approach: 4 deg}\n"
 TRUE_US = {"q1": (604.0, 1533.0, 2491.0), "q3": (650.0, 1560.0, 2420.0)}
-STATED = {"board": "front", "channel": 0, "oscillator_hz": 25e6, "prescale": 121}
-STATED |= {"angles": [-1.0, 1.0], "pulses": [1e-3, 2e-3]}
 KNOTS = (-100.0, 0.0, 100.0)
 
 
@@ -111,24 +110,7 @@ def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, mon
         assert observed(folder) == whole[:cut]
         measure(setup, folder, talk(Person(device)), "guided")
         assert observed(folder) == whole
-        assert (
-            evaluated(setup, folder).servos["q1"].pulses
-            == evaluated(setup, tmp_path / "whole").servos["q1"].pulses
-        )
-
-
-def test_an_entry_that_is_no_observation_is_refused_with_its_place(tmp_path):
-    with Record(tmp_path) as record:
-        record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
-        record.append("what", {})
-    with pytest.raises(DataError, match=r"journal.sqlite: entry 2: .*delete from entry where sequence = 2"):
-        Record(tmp_path)
-
-
-def test_observations_of_an_earlier_version_are_named(tmp_path):
-    (tmp_path / "observations.jsonl").write_text('{"kind": "begun"}\n')
-    with pytest.raises(InputError, match=r"observations of an earlier version of armcal \(observations.jsonl\)"):
-        Record(tmp_path)
+        assert evaluated(setup, folder).servos["q1"].pulses == evaluated(setup, tmp_path / "whole").servos["q1"].pulses
 
 
 def test_a_record_of_another_oscillator_is_refused(tmp_path, monkeypatch):

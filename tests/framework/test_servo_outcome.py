@@ -14,7 +14,7 @@ from armcal.run.experiment import Experiment
 from armcal_bench.servo.fit import outcome_of
 from armcal_bench.servo.outputs import findings, improved, results, write_servo_file
 from armcal_bench.servo.setup import ServoCalibrationSettings
-from armcal_bench.servo.tables import KnownBoard, KnownServo, MeasuredPulse
+from armcal_bench.servo.tables import KnownServo
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS
@@ -75,8 +75,9 @@ def record_of(arm, seen="rotation", noise_deg=0.01, joints=REACH, step=23):
 
 def evaluated(record, nominal, joints=REACH, **settings):
     known = [KnownServo(joint, "front", STATED.servos[joint].table) for joint in joints]
-    boards = {"front": KnownBoard(CLOCK)}
-    return outcome_of(record, known, boards, nominal.experiment, nominal.arm, ServoCalibrationSettings.si(**settings))
+    return outcome_of(
+        record, known, {"front": CLOCK}, nominal.experiment, nominal.arm, ServoCalibrationSettings.si(**settings)
+    )
 
 
 def worst_us(outcome):
@@ -145,22 +146,6 @@ def test_writing_keeps_every_file_before_and_the_numbers_that_were_found(part, t
     assert write_servo_file(path, changed) is None
     assert write_servo_file(path, STATED) == tmp_path / "servos.yaml.before-2"
     assert (tmp_path / "servos.yaml.before-1").read_bytes() == (CONFIGS / "servos.yaml").read_bytes()
-
-
-def test_by_a_new_oscillator_servos_that_were_not_measured_stand_where_they_stood(nominal):
-    record = record_of(nominal, joints=("q1",))
-    known = [KnownServo("q1", "front", STATED.servos["q1"].table)]
-    true_tick = PulseClock(25.4e6, 121).tick
-    board = KnownBoard(CLOCK, (MeasuredPulse(300, 300 * true_tick, 0.05 * US),))
-    settings = ServoCalibrationSettings(sag="none")
-    found = outcome_of(record, known, {"front": board}, nominal.experiment, nominal.arm, settings)
-    changed = improved(STATED, found)
-    assert changed.boards["front"].oscillator_hz == pytest.approx(25.4e6, rel=1e-4)
-    # A pulse of as many counts is shorter by a faster oscillator, whatever prescale the board gets next time.
-    shorter = CLOCK.oscillator_hz / changed.boards["front"].oscillator_hz
-    assert changed.servos["q1"].pulses[1] == pytest.approx(STATED.servos["q1"].pulses[1] * shorter, rel=1e-5)
-    for before, after in zip(STATED.servos["q2"].pulses, changed.servos["q2"].pulses, strict=True):
-        assert after == pytest.approx(before * shorter, rel=1e-9)
 
 
 @pytest.mark.slow

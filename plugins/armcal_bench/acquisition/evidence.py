@@ -1,6 +1,6 @@
 """What measured poses say of the run itself: whether the arm is where it was commanded, stands, and in which frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,11 +9,11 @@ from armcal.base.arrays import Array
 
 from armcal_bench.acquisition.settings import ArrivalSettings
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.measured_frame import FrameMistake, frame_mistake
+from armcal_bench.measured_frame import FEWEST, FrameMistake, frame_mistake
 from armcal_bench.settling import Stand, pose_of
 
 _ENOUGH = 5
-_SURE = 5.0  # Standard deviations
+_SURE, _FEWEST_STANDS = 2.5, 3  # Standard deviations, in each of most stands
 _MINUTE = 60.0
 
 
@@ -85,22 +85,23 @@ class Drift:
 
     @classmethod
     def of(cls, stands: Sequence[Stand]) -> "Drift | None":
-        """One that at least half of the stands show beyond doubt."""
-        if not stands:
+        """One that most of the stands show, three at least."""
+        if len(stands) < _FEWEST_STANDS:
             return None
         rates, sds = (np.array([getattr(stand, name) for stand in stands]) for name in ("rates", "sds"))
         moving = int(np.sum(np.sqrt(np.mean((rates / sds) ** 2, axis=1)) > _SURE))
-        if 2 * moving < len(stands):
+        if 2 * moving <= len(stands):
             return None
         return cls(float(np.sqrt(np.mean(np.sum(rates**2, axis=1)))), moving)
 
     @property
     def sentence(self) -> str:
         speed = _MINUTE * 1000 * self.speed
+        amount = f"{speed:.{1 if speed < 10 else 0}f} mm/min"
         return (
-            f"the target moves by {speed:.{1 if speed < 10 else 0}f} mm/min while the arm should stand (in {self.poses} "
-            "poses): a joint gives way. Look at the screws of the horns, at gears and supply; a servo that is too weak "
-            "for its load gives way as well: measure poses in which it carries less"
+            f"the target moves by {amount} while the arm should stand (in {self.poses} poses): a joint gives way. "
+            "Look at the screws of the horns, at gears and supply; a servo that is too weak for its load gives way as "
+            "well: measure poses in which it carries less"
         )
 
     @property
@@ -121,14 +122,18 @@ class Evidence:
 
     Args:
         arrival: compares poses with the model's.
+        borne: whether a mistake of the tracker's frame ends no run; by default each does.
+        fewest: poses that show one.
 
     Attributes:
         doubted: what was recorded of poses that do not count as measured, by their index.
     """
 
-    def __init__(self, arrival: Arrival) -> None:
+    def __init__(
+        self, arrival: Arrival, borne: Callable[[FrameMistake], bool] = lambda mistake: False, fewest: int = FEWEST
+    ) -> None:
         self.doubted: dict[int, Mapping[str, Any]] = {}
-        self.arrival = arrival
+        self.arrival, self._borne, self._fewest = arrival, borne, fewest
         self._stands: list[tuple[int, Stand]] = []
         self._failed = 0
 
@@ -156,17 +161,23 @@ class Evidence:
         """A motion of the target in the last so many stands, or in all of them."""
         return Drift.of([stand for _, stand in self._stands[-last:]])
 
-    def check_frame(self, measured: Mapping[int, Array]) -> None:
-        """Refuse other units or another frame than expected, by everything that was seen.
+    def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
+        """What is wrong with the tracker's units or handedness, by everything that was seen.
 
         Args:
             measured: ``base_T_target`` (4 x 4, m) of measured poses, by their index.
+        """
+        glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
+        doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
+        seen = {**glimpsed, **measured, **doubted}
+        return self.arrival.mistake(seen) if len(seen) >= self._fewest else None
+
+    def check_frame(self, measured: Mapping[int, Array]) -> None:
+        """Refuse other units or another frame than expected; see ``mistake``.
 
         Raises:
             FrameRefused: they are others.
         """
-        glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
-        doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
-        if (mistake := self.arrival.mistake({**glimpsed, **measured, **doubted})) is not None:
-            kept = "The poses that were measured are kept as they came"
-            raise FrameRefused(f"{mistake.sentence}. {mistake.mend} {kept}")
+        mistake = self.mistake(measured)
+        if mistake is not None and not self._borne(mistake):
+            raise FrameRefused(f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came")

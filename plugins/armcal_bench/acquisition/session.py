@@ -5,15 +5,16 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceIdentity, DeviceUnwellError, open_device, state_of
+from armcal.devices.device import DeviceError, DeviceIdentity, DeviceUnwellError, open_device, state_of
 from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 
@@ -26,6 +27,7 @@ from armcal_bench.acquisition.recovery import DeviceLost, Recovery
 from armcal_bench.acquisition.run_log import (
     OURS,
     EndedHow,
+    Log,
     Progress,
     RunLog,
     in_order,
@@ -48,6 +50,7 @@ from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.settling import Settled, pose_of
 
 T = TypeVar("T")
+WhenStopped = Literal["park", "hold"]
 _TRIES = 2
 _READINGS = 10  # Of servos that know where they stand: their mean is finer than a count
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
@@ -55,10 +58,11 @@ _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by its
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended, and a sentence why."""
+    """How a run ended, a sentence why, and what the arm does then where it does not park."""
 
     how: EndedHow
     sentence: str
+    arm: str = "the arm holds"
 
 
 class AcquisitionRun:
@@ -72,6 +76,7 @@ class AcquisitionRun:
         log: the journal, in which every step is written as it is made.
         evidence: of what is wrong with the tracker's frame, or with the arm.
         on_progress: called after each pose.
+        when_stopped: what the arm does when somebody asks for the end.
     """
 
     def __init__(
@@ -80,10 +85,12 @@ class AcquisitionRun:
         identity: DeviceIdentity,
         scheduler: Scheduler,
         gate: MotionGate,
-        log: RunLog,
+        log: Log,
         evidence: Evidence,
         on_progress: Callable[[Progress], None],
+        when_stopped: WhenStopped = "park",
     ) -> None:
+        self._when_stopped = when_stopped
         self._drive, self._scheduler, self._gate = drive, scheduler, gate
         self._recovery = Recovery(drive.device, identity, gate, drive.settings.lost.park, self._notice)
         self._log, self._evidence, self._on_progress = log, evidence, on_progress
@@ -110,9 +117,11 @@ class AcquisitionRun:
             except JointGivesWay as fault:
                 return self._park_and_end("failed", str(fault))
             except (StopRequested, DeviceUnwellError) as request:
+                if self._when_stopped == "hold" and self._gate.asked_to_end():
+                    return self._hold_and_end(str(request))
                 return self._park_and_end("parked", str(request))
             except DeviceLost as loss:
-                return self._end(Ending("held", f"{loss}; {_AS_IT_IS}"))
+                return self._end(Ending("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS))
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
             self._park_after(fault)
@@ -211,6 +220,7 @@ class AcquisitionRun:
             **self._here(),
             **settled.record,
             "deviation": settled.deviations[:3].tolist(),
+            "turn_deviation": [float(d) if np.isfinite(d) else None for d in settled.deviations[3:]],
             "frames": settled.frames,
             "rejected": settled.rejected,
             "temperature": self._settings.temperature,
@@ -270,6 +280,14 @@ class AcquisitionRun:
         self._left.remove(pose)
         self._on_progress(self._log.progress)
 
+    def _hold_and_end(self, why: str) -> Ending:
+        """Stay, should the host fall silent too."""
+        try:
+            self._drive.hold()
+        except DeviceError:
+            return self._end(Ending("held", f"{why}, while the board was lost", _AS_IT_IS))
+        return self._end(Ending("held", why))
+
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
         """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
@@ -278,7 +296,7 @@ class AcquisitionRun:
             if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
                 self._persist(self._drive.release, lambda: None)
         except (DeviceLost, DeviceUnwellError) as loss:
-            return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}"))
+            return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}", _AS_IT_IS))
         return self._end(Ending(how, why))
 
     def _park_after(self, fault: Exception) -> None:
@@ -323,6 +341,7 @@ class RunOptions:
     may_energise: Callable[[FirstMotion], bool]
     on_progress: Callable[[Progress], None]  # called after each pose
     unchecked: bool = False  # drive servos too of which nobody has checked that they move their joint
+    when_stopped: WhenStopped = "park"  # what the arm does when somebody asks for the end
     waits: Waits = field(default_factory=Waits)  # says what is waited for
 
 
@@ -345,8 +364,8 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
     experiment = prepared.bench.experiment
     measured_by(experiment)
     header = _header(prepared, plan)
-    opened = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
-    with prepared.bench.clock() as clock, opened as journal:
+    kept = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
+    with prepared.bench.clock() as clock, kept as journal:
         log = RunLog(journal)
         progress, identity = log.progress, log.identity
         _check_frame(prepared, progress, options.folder)
@@ -357,10 +376,10 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
             ending = Ending(how, "it was done before" if how == "done" else why)
         else:
             try:
-                with _opened(prepared, options, clock, log) as (gate, identity):
+                with opened(prepared, options, clock, partial(_check_board, log)) as (gate, identity):
                     log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
                     evidence = Evidence(prepared.arrival)
-                    run = _prepared_run(prepared, options, log, gate, identity, evidence)
+                    run = ready_run(prepared, options, log, gate, identity, evidence)
                     ending, progress, drift = run.run(), log.progress, evidence.drift()
             except (Exception, SystemExit):
                 if identity is not None:
@@ -418,11 +437,19 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
     return {"plan": digest, "config": identity_of({**data, "bench": bench}), "began": time.time()}
 
 
+def _check_board(log: RunLog, identity: DeviceIdentity) -> None:
+    if log.identity is not None and log.identity.digest != identity.digest:
+        raise InputError(
+            f"the run was begun with another board, or another calibration of it, than {identity.name}.",
+            hint="Connect the board that the run began with, with the servo file that it began with.",
+        )
+
+
 @contextmanager
-def _opened(
-    prepared: Prepared, options: RunOptions, clock: Clock, log: RunLog
+def opened(
+    prepared: Prepared, options: RunOptions, clock: Clock, check: Callable[[DeviceIdentity], None]
 ) -> Iterator[tuple[MotionGate, DeviceIdentity]]:
-    """With device and tracker, both alive; nothing moves."""
+    """With device and tracker, both alive; nothing moves. ``check`` may refuse a device."""
     device, monitor = prepared.device, TrackerMonitor(prepared.bench, clock)
 
     def pause() -> None:
@@ -431,11 +458,7 @@ def _opened(
 
     with closing(monitor, device):
         identity = open_device(device, clock)
-        if log.identity is not None and log.identity.digest != identity.digest:
-            raise InputError(
-                f"the run was begun with another board, or another calibration of it, than {identity.name}.",
-                hint="Connect the board that the run began with, with the servo file that it began with.",
-            )
+        check(identity)
         wiring = wiring_of(prepared.bench.experiment.source, device)
         if wiring is not None and not options.unchecked:
             wiring.check(device.joint_names, identity.adapter)
@@ -445,10 +468,10 @@ def _opened(
         yield MotionGate(monitor, clock, prepared.settings.lost, options.asked_to_end, options.waits), identity
 
 
-def _prepared_run(
+def ready_run(
     prepared: Prepared,
     options: RunOptions,
-    log: RunLog,
+    log: Log,
     gate: MotionGate,
     identity: DeviceIdentity,
     evidence: Evidence,
@@ -463,7 +486,8 @@ def _prepared_run(
     drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
-        drive.thermal_state.go_on(progress.thermal_state, progress.angles, clock.wall() - progress.at)
+        standing = {**progress.angles, **state_of(device).angles}
+        drive.thermal_state.go_on(progress.thermal_state, standing, clock.wall() - progress.at)
     angles = state_of(device).angles
     releases, measured = settings.at_end == "release", drive.measured()
     start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
@@ -472,4 +496,4 @@ def _prepared_run(
     before = options.asked_to_end()
     if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-    return AcquisitionRun(drive, identity, scheduler, gate, log, evidence, options.on_progress)
+    return AcquisitionRun(drive, identity, scheduler, gate, log, evidence, options.on_progress, options.when_stopped)

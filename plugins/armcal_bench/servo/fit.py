@@ -1,4 +1,4 @@
-"""Pulse tables, backlash, oscillators and springs from what a tracker, or somebody, saw of each joint's sweep.
+"""Pulse tables, backlash and springs from what a tracker, or somebody, saw of each joint's sweep.
 
 All sweeps are one problem of the arm's model: each joint stands where its table puts the pulse, with corrections at the
 table's knots, less half the backlash behind where it came from. The model's axes and springs move with them, every
@@ -26,7 +26,7 @@ from armcal_bench.servo.record import ANGLE, POSE
 from armcal_bench.servo.rigid_arm import RigidArm, lever, turn_of_point, twist_angles
 from armcal_bench.servo.setup import ServoCalibrationSettings
 from armcal_bench.servo.sighting import BODY, TABLES, Body, BodyFit, Corrections, Seen
-from armcal_bench.servo.tables import FittedServo, KnownBoard, KnownServo, Outcome, Zero, piecewise
+from armcal_bench.servo.tables import FittedServo, KnownServo, Outcome, Zero, piecewise
 from armcal_bench.servo.trial import permuted
 
 Entry = Mapping[str, Any]
@@ -40,6 +40,7 @@ _ROUNDS, _STEADY = 8, 1e-6
 _FAR_OFF = 5.0
 _MOST_SCATTER = math.radians(1.0)
 _DETERMINED = 0.2  # Of the deviation that was assumed: below it the observations determine the number
+_NO_TABLE = "its angles neither rise nor fall with the pulse, as if it slipped, or was too hot and let go"
 _CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
 
 
@@ -105,7 +106,7 @@ class _Sweep:
 def outcome_of(
     entries: Sequence[Entry],
     servos: Sequence[KnownServo],
-    boards: Mapping[str, KnownBoard],
+    clocks: Mapping[str, PulseClock],
     experiment: Experiment,
     arm: Arm,
     settings: ServoCalibrationSettings,
@@ -118,10 +119,10 @@ def outcome_of(
     left_out = permuted(entries, [servo.joint for servo in servos], rigid)
     while True:
         remaining = [servo for servo in servos if servo.joint not in left_out]
-        swept = {servo.joint: _sweep_of(entries, servo, boards, rigid, settings) for servo in remaining}
+        swept = {servo.joint: _sweep_of(entries, servo, clocks, rigid, settings) for servo in remaining}
         silent = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, str)}
         sweeps = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, _Sweep)}
-        outcome = _fitted(sweeps, boards, rigid, experiment, arm, settings)
+        outcome = _fitted(sweeps, clocks, rigid, experiment, arm, settings)
         worst = max(outcome.servos.values(), key=lambda servo: servo.scatter, default=None)
         if worst is None or worst.scatter <= _MOST_SCATTER:
             return replace(outcome, silent={**outcome.silent, **silent, **left_out})
@@ -134,12 +135,12 @@ def outcome_of(
 def _sweep_of(
     entries: Sequence[Entry],
     servo: KnownServo,
-    boards: Mapping[str, KnownBoard],
+    clocks: Mapping[str, PulseClock],
     rigid: RigidArm,
     settings: ServoCalibrationSettings,
 ) -> _Sweep | str:
     """A joint's lines and a first table, or why they show none."""
-    joint, tick = servo.joint, boards[servo.board].clock.tick
+    joint, tick = servo.joint, clocks[servo.board].tick
     lines = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
     seen = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
     stated = servo.pulses_at(servo.angles) / tick
@@ -186,12 +187,12 @@ def _sweep_of(
 def _with_first_table(sweep: _Sweep, angles: Array, stated: Array) -> _Sweep | str:
     """The table of least squares through angles (rad), near the stated one where none is."""
     knots = sweep.known.angles
-    weight = 10.0 if sweep.known.trusted_sd is not None else 1e-3
+    weight = 1e-3
     rows = np.vstack(
         [piecewise(knots, np.eye(len(knots)))(angles).reshape(-1, len(knots)), weight * np.eye(len(knots))]
     )
     sweep.pulses = np.linalg.lstsq(rows, np.concatenate([sweep.counts, weight * stated]), rcond=None)[0]
-    return sweep if sweep.is_table else "its angles neither rise nor fall with the pulse: look at its linkage"
+    return sweep if sweep.is_table else _NO_TABLE
 
 
 def _others(lines: Sequence[Entry], joint: str) -> dict[str, float]:
@@ -202,7 +203,7 @@ def _others(lines: Sequence[Entry], joint: str) -> dict[str, float]:
 
 def _fitted(
     sweeps: Mapping[str, _Sweep],
-    boards: Mapping[str, KnownBoard],
+    clocks: Mapping[str, PulseClock],
     rigid: RigidArm,
     experiment: Experiment,
     arm: Arm,
@@ -219,23 +220,15 @@ def _fitted(
         own = {joint: sweep for joint, sweep in sweeps.items() if sweep.by == by}
         if not own:
             continue
-        fit = _TableFit(own, rigid, experiment, arm, settings, zero, boards)
+        fit = _TableFit(own, rigid, experiment, arm, settings, zero, clocks)
         silent |= fit.run()
         servos |= {joint: fit.servo(joint) for joint in own if joint not in silent}
         compliances |= fit.compliances()
         spans |= fit.sag_spans()
-    scales = {name: _oscillator(board, name, servos, zero) for name, board in boards.items()}
-    found = {name: scale for name, scale in scales.items() if scale is not None}
-    clocks = {
-        name: PulseClock(board.clock.oscillator_hz / found.get(name, (1.0, 0.0))[0], board.clock.prescale)
-        for name, board in boards.items()
-    }
-    sds = {name: clocks[name].oscillator_hz * sd / scale for name, (scale, sd) in found.items()}
-    servos = {joint: _lengthened(servo, *found.get(servo.known.board, (1.0, 0.0))) for joint, servo in servos.items()}
     known = {name: change for name, change in compliances.items() if change[1] < _DETERMINED * settings.sag_sd}
     fitted = settings.sag == "fitted"
     undetermined = tuple(name for name in compliances if name not in known and fitted)
-    return Outcome(servos, clocks, sds, silent, known if fitted else {}, undetermined, zero, spans)
+    return Outcome(servos, clocks, silent, known if fitted else {}, undetermined, zero, spans)
 
 
 class _TableFit:
@@ -249,9 +242,9 @@ class _TableFit:
         arm: Arm,
         settings: ServoCalibrationSettings,
         zero: Zero,
-        boards: Mapping[str, KnownBoard],
+        clocks: Mapping[str, PulseClock],
     ) -> None:
-        self._ticks = {joint: boards[sweep.known.board].clock.tick for joint, sweep in sweeps.items()}
+        self._ticks = {joint: clocks[sweep.known.board].tick for joint, sweep in sweeps.items()}
         self._sweeps, self._rigid, self._arm, self._settings = sweeps, rigid, arm, settings
         self._by = next(iter(sweeps.values())).by
         self._keeps_zero = zero == "kept"
@@ -339,10 +332,10 @@ class _TableFit:
         sides: dict[str, list[Array]] = {joint: [] for joint in joints}
         for joint, sweep in self._sweeps.items():
             for other in joints:
-                told = np.array([float(line.get("told", {}).get(other, 0.0)) for line in sweep.lines])
                 own = other == joint
-                rows[other].append(sweep.angles if own else told)
-                sides[other].append(sweep.approaches if own else np.zeros(len(told)))
+                stood = np.array([float(line.get("told", {}).get(other, 0.0)) for line in sweep.lines])
+                rows[other].append(sweep.angles if own else stood)
+                sides[other].append(sweep.approaches if own else np.zeros(len(stood)))
         sweeps = list(self._sweeps.values())
         noise = np.concatenate([s.sds * self._length(s) for s in sweeps])
         numbers = np.repeat(np.arange(len(sweeps)), [len(s.lines) for s in sweeps])
@@ -382,7 +375,7 @@ class _TableFit:
                 at = at - self._pinned(joint) @ at
                 largest = max(largest, float(np.abs(at).max()))
                 if not sweep.corrected(at):
-                    silent[joint] = "its angles neither rise nor fall with the pulse: look at its linkage"
+                    silent[joint] = _NO_TABLE
                 elif self._has_zero:
                     moved = self._fit.value(names[0]) - at[0]
                     self._fit.move(self._zero(joint), self._fit.value(self._zero(joint)) + moved)
@@ -496,44 +489,3 @@ def _without(poses: Array, given: Array) -> Array:
     stiff = poses.copy()
     stiff[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(given).inv().as_matrix()
     return stiff
-
-
-def _oscillator(
-    board: KnownBoard, name: str, servos: Mapping[str, FittedServo], zero: Zero
-) -> tuple[float, float] | None:
-    """By how much longer a board's pulses are than by its stated oscillator, and the deviation; None if nothing says.
-
-    Pulses measured at its pins say it, and trusted tables: their zero is open where zeros are kept.
-    """
-    trusted = [s for s in servos.values() if s.known.board == name and s.known.trusted_sd is not None]
-    if not board.measured and not trusted:
-        return None
-    rows, right, width = [], [], 1 + len(trusted)
-    for pulse in board.measured:
-        rows.append([pulse.counts * board.clock.tick / pulse.sd] + [0.0] * len(trusted))
-        right.append(pulse.length / pulse.sd)
-    for i, servo in enumerate(trusted):
-        stated = servo.known.pulses_at(np.array(servo.angles))
-        slopes = np.gradient(np.array(servo.pulses), np.array(servo.angles))
-        for k, pulse_s in enumerate(servo.pulses):
-            sd = math.hypot(servo.known.trusted_sd or 0.0, servo.pulse_sds[k]) if servo.determined[k] else math.inf
-            row = np.zeros(width)
-            row[0], row[1 + i] = pulse_s / sd, slopes[k] / sd
-            rows.append(row.tolist())
-            right.append(stated[k] / sd)
-        weak = np.zeros(width)
-        weak[1 + i] = 1.0 if zero == "kept" else 1e6
-        rows.append(weak.tolist())
-        right.append(0.0)
-    matrix = np.array(rows)
-    scale = float(np.linalg.lstsq(matrix, np.array(right), rcond=None)[0][0])
-    return scale, float(np.sqrt(np.linalg.pinv(matrix.T @ matrix, hermitian=True)[0, 0]))
-
-
-def _lengthened(servo: FittedServo, scale: float, sd: float) -> FittedServo:
-    """With pulses by a fitted oscillator; knots that nothing determines keep the stated pulse."""
-    if servo.known.trusted_sd is not None or scale == 1.0:
-        return servo
-    known = zip(servo.pulses, servo.pulse_sds, servo.determined, strict=True)
-    pairs = [(p * scale, math.hypot(s * scale, p * sd)) if is_known else (p, s) for p, s, is_known in known]
-    return replace(servo, pulses=tuple(p for p, _ in pairs), pulse_sds=tuple(s for _, s in pairs))

@@ -27,7 +27,6 @@ from armcal.io.plain_files import write_whole, writing
 from armcal_bench.servo.record import next_name
 from armcal_bench.servo.tables import FittedServo, Outcome
 
-_SENSIBLE_HZ = (23e6, 27e6)
 _FAR_CHANGE = 0.1
 _SAG_WORTH = math.radians(0.1)
 
@@ -41,27 +40,12 @@ def is_usable(servo: FittedServo) -> bool:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """A sentence each, of servos, zeros, boards and springs."""
+    """A sentence each, of servos, zeros and springs."""
     texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
     for servo in outcome.servos.values():
         texts += list(_of_servo(servo, outcome))
     if outcome.zero == "kept":
         texts.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
-    for board, clock in outcome.clocks.items():
-        if not any(servo.known.board == board for servo in outcome.servos.values()):
-            continue
-        if board not in outcome.oscillator_sds:
-            texts.append(
-                f"{board}: the oscillator cannot be found from tables that are not known, so it is left at "
-                f"{clock.oscillator_hz / 1e6:.3f} MHz and the tables count by it. Angles are right all the same. To "
-                "know the oscillator, measure a pulse (bench.servo.measured_pulses) or trust a table "
-                "(bench.servo.trusted)."
-            )
-        if not _SENSIBLE_HZ[0] <= clock.oscillator_hz <= _SENSIBLE_HZ[1]:
-            texts.append(
-                f"{board}: an oscillator of {clock.oscillator_hz / 1e6:.2f} MHz is outside "
-                f"{_SENSIBLE_HZ[0] / 1e6:.0f} to {_SENSIBLE_HZ[1] / 1e6:.0f} MHz: check what it was measured by."
-            )
     return texts + _of_springs(outcome)
 
 
@@ -218,23 +202,17 @@ Part = TypeVar("Part", BoardSettings, ServoSettings)
 
 
 def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
-    """The servo file with the fitted numbers; servos whose board has another oscillator now keep their counts.
+    """The servo file with the fitted numbers.
 
     Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
     part is kept whose pulses its servo bears.
     """
     boards = {name: board if board.id else _changed(board, id=adapter) for name, board in file.boards.items()}
-    for name in outcome.oscillator_sds:
-        hz = outcome.clocks[name].oscillator_hz
-        boards[name] = _changed(boards[name], oscillator_hz=hz)
     servos: dict[str, ServoSettings] = {}
     for joint, servo in file.servos.items():
         fitted_servo = outcome.servos.get(joint)
         table = None if fitted_servo is None else _fitted_table(fitted_servo, servo, outcome, boards[servo.board])
-        if table is None:
-            longer = file.boards[servo.board].oscillator_hz / boards[servo.board].oscillator_hz
-            same = PulseTable(servo.angles, tuple(pulse * longer for pulse in servo.pulses))
-            table = _borne_part(same, servo, boards[servo.board]) or servo.table
+        table = table or servo.table
         servos[joint] = _changed(servo, angles=table.angles, pulses=table.pulses)
     return ServoFile(boards, servos)
 
@@ -243,8 +221,6 @@ def _fitted_table(
     fitted_servo: FittedServo, servo: ServoSettings, outcome: Outcome, board: BoardSettings
 ) -> PulseTable | None:
     """The table that is written for a servo that was measured; None where none can be, and its own is kept."""
-    if fitted_servo.known.trusted_sd is not None:
-        return servo.table
     if not is_usable(fitted_servo):
         return None
     # Counts stay what they are: the file's board may have another oscillator than that of the record.
@@ -314,10 +290,6 @@ def _text_of(path: Path, before: str, file: ServoFile) -> str:
 def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
     return {
         "servos": {joint: _servo(servo, outcome, changed) for joint, servo in outcome.servos.items()},
-        "boards": {
-            name: {"oscillator_hz": clock.oscillator_hz, "oscillator_sd_hz": outcome.oscillator_sds.get(name)}
-            for name, clock in outcome.clocks.items()
-        },
         "compliances_rad_per_Nm": {name: {"value": v, "sd": sd} for name, (v, sd) in outcome.compliances.items()},
         "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.undetermined)},
         "findings": [*findings(outcome), *_narrowed(outcome, changed)],

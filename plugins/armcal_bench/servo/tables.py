@@ -18,34 +18,16 @@ class KnownServo:
 
     joint: str  # that it turns
     board: str  # that drives it
-    table: PulseTable  # as stated; pulses by the board's stated oscillator
-    trusted_sd: float | None = None  # of the table's pulses (s), where the table is believed; None: it is to be fitted
+    table: PulseTable  # as stated; pulses by the board's oscillator
     knots: tuple[float, ...] = ()  # angles (rad) that the table is to be given at; empty: those of the stated one
 
     @property
     def angles(self) -> Array:
-        return np.array((self.trusted_sd is None and self.knots) or self.table.angles)
+        return np.array(self.knots or self.table.angles)
 
     def pulses_at(self, angles: Array) -> Array:
         """The stated table's pulses (s) at angles (rad)."""
         return np.asarray(piecewise(np.array(self.table.angles), np.array(self.table.pulses))(angles))
-
-
-@dataclass(frozen=True)
-class MeasuredPulse:
-    """A pulse measured at a board's pin, with an oscilloscope for example: counts, length (s), its deviation (s)."""
-
-    counts: int
-    length: float
-    sd: float
-
-
-@dataclass(frozen=True)
-class KnownBoard:
-    """A board: its stated oscillator and prescale, and pulses measured at its pins."""
-
-    clock: PulseClock
-    measured: tuple[MeasuredPulse, ...] = ()
 
 
 def piecewise(at: Array, values: Array) -> BSpline:
@@ -86,8 +68,7 @@ class Outcome:
     """
 
     servos: Mapping[str, FittedServo]  # by joint
-    clocks: Mapping[str, PulseClock]  # by board, at the fitted oscillator, or the stated one
-    oscillator_sds: Mapping[str, float]  # by board (Hz), of those that are determined
+    clocks: Mapping[str, PulseClock]  # by board, as stated when it was measured
     silent: Mapping[str, str]  # why a joint's table could not be found, by joint
     compliances: Mapping[str, tuple[float, float]]
     undetermined: tuple[str, ...]  # compliances that the observations do not determine
