@@ -31,8 +31,6 @@ def test_axes_are_those_about_which_the_tool_turns(arm):
         moved = arm.tool({**pose, joint: pose[joint] + step}) @ np.linalg.inv(arm.tool(pose))
         assert Rotation.from_matrix(moved[:3, :3]).as_rotvec() / step == pytest.approx(axis, abs=1e-5)
         assert moved @ [*origin, 1] == pytest.approx([*origin, 1], abs=1e-10)
-        tool = arm.tool(pose)
-        assert arm.angle_of_rotation(joint, pose, tool[:3, :3]) == pytest.approx(pose[joint])
 
 
 BASE = {"q1": 0.1, "q2": 0.5, "q3": -0.2, "q4": -0.7, "q5": 0.3, "q6": 0.4}

@@ -341,8 +341,8 @@ class RunOptions:
     may_energise: Callable[[FirstMotion], bool]
     on_progress: Callable[[Progress], None]  # called after each pose
     unchecked: bool = False  # drive servos too of which nobody has checked that they move their joint
-    when_stopped: WhenStopped = "park"  # what the arm does when somebody asks for the end
     waits: Waits = field(default_factory=Waits)  # says what is waited for
+    when_stopped: WhenStopped = "park"  # what the arm does when somebody asks for the end
 
 
 @dataclass(frozen=True)

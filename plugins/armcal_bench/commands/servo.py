@@ -79,7 +79,7 @@ def servo(
                 with _stoppable(console):
                     measure(setup, out, talk, "guided" if guided else "automatic")
             _evaluate(console, setup, out, keep)
-        if parks or release:
+        if setup is not None and (parks or release):
             with _stoppable(console):
                 park(setup, talk, "release" if release else "hold")
 

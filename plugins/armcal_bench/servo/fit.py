@@ -99,8 +99,8 @@ class _Sweep:
     def along(self, residuals: Array) -> Array:
         """What residuals of the body are as turns about the joint's axis (N, rad)."""
         if self.by == "position":
-            return np.einsum("ni,in->n", lever(self.arms, self.axis), residuals)
-        return np.einsum("nji,j,in->n", self.poses[:, :3, :3], self.axis, residuals)
+            return np.asarray(np.einsum("ni,in->n", lever(self.arms, self.axis), residuals))
+        return np.asarray(np.einsum("nji,j,in->n", self.poses[:, :3, :3], self.axis, residuals))
 
 
 def outcome_of(
@@ -209,17 +209,17 @@ def _fitted(
     arm: Arm,
     settings: ServoCalibrationSettings,
 ) -> Outcome:
-    """Sweeps of a tracker's rotations, of its positions and of somebody's eyes have a problem each."""
+    """Sweeps of a tracker's rotations have a problem, those of its positions one, and each of somebody's eyes."""
     tracked = all(sweep.by != "somebody" for sweep in sweeps.values())
     zero: Zero = "kept" if settings.zero == "kept" and tracked else "measured"
     servos: dict[str, FittedServo] = {}
     silent: dict[str, str] = {}
     compliances: dict[str, tuple[float, float]] = {}
     spans: dict[str, float] = {}
-    for by in ("rotation", "position", "somebody"):
-        own = {joint: sweep for joint, sweep in sweeps.items() if sweep.by == by}
-        if not own:
-            continue
+    together: dict[tuple[str, str], dict[str, _Sweep]] = {}
+    for joint, sweep in sweeps.items():
+        together.setdefault((sweep.by, joint if sweep.by == "somebody" else ""), {})[joint] = sweep
+    for own in together.values():
         fit = _TableFit(own, rigid, experiment, arm, settings, zero, clocks)
         silent |= fit.run()
         servos |= {joint: fit.servo(joint) for joint in own if joint not in silent}
@@ -338,7 +338,7 @@ class _TableFit:
                 sides[other].append(sweep.approaches if own else np.zeros(len(stood)))
         sweeps = list(self._sweeps.values())
         noise = np.concatenate([s.sds * self._length(s) for s in sweeps])
-        numbers = np.repeat(np.arange(len(sweeps)), [len(s.lines) for s in sweeps])
+        numbers = np.repeat(np.arange(len(sweeps), dtype=float), [len(s.lines) for s in sweeps])
         angles, approaches = ({j: np.concatenate(parts) for j, parts in of.items()} for of in (rows, sides))
         return Seen(angles, np.concatenate([s.poses for s in sweeps]), noise, approaches, numbers)
 
@@ -443,31 +443,15 @@ class _TableFit:
         )
 
     def _absolute(self, joint: str) -> float:
-        """What is to be added to the table's angles for them to be absolute, by the model and the tracker's base."""
-        sweep = self._sweeps[joint]
+        """What is to be added to the table's angles for them to be absolute, by the stated model and base."""
         if self._keeps_zero or not self._has_zero:
             return 0.0
-        others = _others(sweep.lines, joint)
-        seen = sweep.poses if self._by == "position" else _without(sweep.poses, self._given()[joint])
-        shown = [
-            self._rigid.angle_of_position(joint, others, pose[:3, 3])
-            if self._by == "position"
-            else self._rigid.angle_of_rotation(joint, others, pose[:3, :3])
-            for pose in seen
-        ]
-        lag = self._fit.value(f"{self._arm.name}.{TABLES}.lag{self._numbers[joint]}") if joint in self._lags else 0.0
-        stood = sweep.angles - lag * sweep.approaches
-        return float(np.angle(np.mean(np.exp(1j * (np.array(shown) - stood)))))
-
-    def _given(self) -> dict[str, Array]:
-        """What the springs give in each line (N x 3): a rotation vector in the body's axes (rad), or a shift (m)."""
-        bent, stiff = (
-            self._fit.residuals(dict.fromkeys(self._compliances, 0.0) if rigid else None) for rigid in (0, 1)
-        )
-        if self._by == "position":
-            return {joint: part.T for joint, part in self._parts(stiff - bent).items()}
-        turned = Rotation.from_rotvec(stiff.T) * Rotation.from_rotvec(bent.T).inv()
-        return {joint: part.T for joint, part in self._parts(turned.as_rotvec().T).items()}
+        parameters, fitted = self._fit.parameters, (*self._compliances, *self._names(joint))
+        lags = f"{self._arm.name}.{TABLES}.lag"
+        stated = {b.name: b.nominal for b in parameters.free if b.name not in fitted and not b.name.startswith(lags)}
+        stated |= {f"{BODY}.seat_rotation": NO_TURN} if self._by == "rotation" else {}
+        sweep = self._sweeps[joint]
+        return float(np.mean(sweep.along(self._parts(self._fit.residuals(stated))[joint])[sweep.kept]))
 
     def compliances(self) -> dict[str, tuple[float, float]]:
         if not self._compliances:
@@ -476,16 +460,7 @@ class _TableFit:
         return {n: (self._fit.value(n), sd) for n, sd in zip(self._compliances, sds, strict=True)}
 
     def sag_spans(self) -> dict[str, float]:
-        if not self._compliances:
-            return dict.fromkeys(self._sweeps, 0.0)
-        return {
-            joint: float(np.ptp(self._sweeps[joint].along(given.T))) if len(given) else 0.0
-            for joint, given in self._given().items()
-        }
-
-
-def _without(poses: Array, given: Array) -> Array:
-    """Poses (N x 4 x 4) with rotations in the body's axes (N x 3) taken out."""
-    stiff = poses.copy()
-    stiff[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(given).inv().as_matrix()
-    return stiff
+        """How much what the springs give varies over each sweep (rad)."""
+        stiff = self._fit.residuals(dict.fromkeys(self._compliances, 0.0)) - self._fit.residuals()
+        parts = self._parts(stiff)
+        return {joint: float(np.ptp(sweep.along(parts[joint]))) for joint, sweep in self._sweeps.items()}

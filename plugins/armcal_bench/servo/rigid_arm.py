@@ -60,18 +60,6 @@ class RigidArm:
         _, axes, origins = (np.asarray(dm.full()) for dm in self._function(self._commands(pose)))
         return {name: (axes[:, i], origins[:, i]) for i, name in enumerate(self.arm.joint_names)}
 
-    def angle_of_rotation(self, joint: str, pose: Pose, rotation: Array) -> float:
-        """The angle (rad) of a joint at which the tool turns nearest to a rotation (3x3)."""
-        at_zero = {**pose, joint: 0.0}
-        turned = Rotation.from_matrix(np.array([rotation @ self.tool(at_zero)[:3, :3].T]))
-        return float(twist_angles(turned, self.axis(joint, at_zero)[0])[0])
-
-    def angle_of_position(self, joint: str, pose: Pose, position: Array) -> float:
-        """The same by where the tool is (3, m)."""
-        at_zero = {**pose, joint: 0.0}
-        axis, origin = self.axis(joint, at_zero)
-        return turn_of_point(self.tool(at_zero)[:3, 3] - origin, position - origin, axis)
-
     def _commands(self, pose: Pose) -> Array:
         return np.array([float(pose.get(joint, 0.0)) for joint in self.joints])
 

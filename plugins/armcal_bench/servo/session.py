@@ -109,7 +109,6 @@ def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int
 
 def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record) -> None:
     """Drive the sweeps that are left as a measuring run; the arm ends in its base pose."""
-    _check_cools(setup)
     device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
     poses: dict[str, tuple[dict[str, float], dict[str, int]]] = {}
     planned: dict[str, list[str]] = {}
@@ -134,6 +133,7 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
     def check(identity: DeviceIdentity) -> None:
         if record.is_measured:
             check_same(setup, record, identity)
+        _check_cools(setup)
 
     prepared, options = setup.run(device, poses), talk.options(report)
     with opened(prepared, options, clock, check) as (gate, identity):

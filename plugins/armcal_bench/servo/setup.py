@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, takewhile
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
@@ -255,7 +255,7 @@ class Setup:
     def acquisition(self) -> AcquisitionSettings:
         """Of the runs: an arm whose tables may be wrong is anywhere; it rests in the base pose."""
         own = self.settings
-        changes = {"rate_deg_per_s": own.rate_deg_per_s, "period": own.period, "silence": own.silence}
+        changes: dict[str, Any] = {"rate_deg_per_s": own.rate_deg_per_s, "period": own.period, "silence": own.silence}
         changes |= {"park": dict(self.base), "at_end": "hold", "angles": "commanded", "arrival": ANYWHERE}
         return self.bench.settings.acquisition.model_copy(update=changes)
 

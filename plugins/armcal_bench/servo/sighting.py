@@ -28,7 +28,7 @@ from typing_extensions import override
 
 By = Literal["rotation", "position", "pose"]  # What of the body is compared
 TABLES, BODY = "tables", "body"
-_SCALE_RAD, _SCALE_M = 0.05, 0.01
+_SCALE_RAD = 0.05
 _MOST_STEPS, _DAMPING, _AT_REST = 40, 1e-6, 1e-9
 _QUATERNION = ("qw", "qx", "qy", "qz")
 
@@ -150,7 +150,7 @@ class Seen:
         quaternions = np.array([quaternion_of(rotation) for rotation in rotations])
         channels |= {f"{BODY}.{axis}": self.poses[:, i, 3] for i, axis in enumerate("xyz")}
         channels |= {f"{BODY}.{name}": quaternions[:, i] for i, name in enumerate(_QUATERNION)}
-        channels |= {f"{BODY}.sweep": np.zeros(count) if self.sweeps is None else self.sweeps.astype(float)}
+        channels |= {f"{BODY}.sweep": np.zeros(count) if self.sweeps is None else self.sweeps}
         noise = self.noise if self.place_noise is None else self.place_noise
         channels |= {f"{BODY}.noise_rotation": self.noise, f"{BODY}.noise": noise}
         return Dataset(tuple(str(i) for i in range(count)), channels)
@@ -207,7 +207,7 @@ class BodyFit:
         posed = PosedProblem(self.problem)
         self.values = posed.values(descended(posed, posed.x(self.values), _MOST_STEPS, _DAMPING, _AT_REST))
 
-    def residuals(self, changes: Mapping[str, float] | None = None) -> Array:
+    def residuals(self, changes: Mapping[str, Any] | None = None) -> Array:
         """Raw, of each record (rows x N), with other values of some numbers."""
         values = self.values.copy()
         for name, value in (changes or {}).items():
