@@ -1,7 +1,7 @@
 """All that was observed, each entry of the journal on disk before anything else happens."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -60,10 +60,6 @@ class Record:
     def begun(self) -> Mapping[str, Any] | None:
         """The first entry; None where there is none."""
         return self._entries[0] if self._entries else None
-
-    @property
-    def is_measured(self) -> bool:
-        return len(self._entries) > 1
 
     def set_aside(self) -> Path:
         """Keep the journal under another name, which is given, and be empty.
@@ -141,35 +137,26 @@ def next_name(path: Path) -> Path:
     return kept
 
 
-def begin(setup: Setup, record: Record, device: DeviceIdentity | None, say: Callable[[str], None]) -> None:
+def begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
     """The first entry of a record: by which tables and in which base pose it is measured.
 
-    It is written when nothing is left that could refuse the run. One that stands there without a measurement after it
-    is of a run that measured nothing, and must not be taken for this run's.
+    It is written when nothing is left that could refuse the run.
     """
-    if record.is_measured:
-        return
-    servos = {joint: _as_stated(setup, joint) for joint in setup.base}
-    board = {} if device is None else {"device": device.name, "adapter": device.adapter}
-    content = {"servos": servos, **board, "base": dict(setup.base)}
-    if (begun := record.begun) is not None:
-        if {**begun, **content} == begun:
-            return
-        kept = record.set_aside()
-        say(
-            f"{record.path}: it was begun with another base pose, servo file or board, and holds no measurement; it is "
-            f"kept as {kept.name}, and this run begins anew."
-        )
-    record.append(BEGUN, content)
+    if record.begun is None:
+        servos = {joint: _as_stated(setup, joint) for joint in setup.base}
+        content = {"servos": servos, "device": device.name, "adapter": device.adapter, "base": dict(setup.base)}
+        record.append(BEGUN, content)
 
 
 def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
-    """A record that holds measurements goes on only with the board, the wiring and the base pose that it began with.
+    """A record goes on only with the board, the wiring and the base pose that it began with.
 
     Raises:
         InputError: it would be another one.
     """
-    begun = record.entries[0]
+    begun = record.begun
+    if begun is None:
+        return
     where = Location(str(record.path))
     adapter = str(begun.get("adapter", ""))
     if adapter and device.adapter and adapter != device.adapter:

@@ -57,8 +57,8 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
     """
     with Record(folder) as record, setup.bench.clock() as clock:
         tables = {joint: setup.table_of(joint) for joint in setup.base}
-        if record.is_measured:
-            stated, _ = stated_by(setup, record.entries[0], tuple(setup.base))
+        if record.begun is not None:
+            stated, _ = stated_by(setup, record.begun, tuple(setup.base))
             tables = {servo.joint: (servo.table, tables[servo.joint][1]) for servo in stated}
         if how == "guided":
             targets = targets_of(setup)
@@ -131,14 +131,13 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         return 1 / _FAR_GAIN < mistake.frame.gain < _FAR_GAIN
 
     def check(identity: DeviceIdentity) -> None:
-        if record.is_measured:
-            check_same(setup, record, identity)
+        check_same(setup, record, identity)
         _check_cools(setup)
 
     prepared, options = setup.run(device, poses), talk.options(report)
     with opened(prepared, options, clock, check) as (gate, identity):
         run = ready_run(prepared, options, log, gate, identity, Evidence(prepared.arrival, is_borne))
-        begin(setup, record, identity, talk.say)
+        begin(setup, record, identity)
         ending = run.run()
     if ending.how == "refused":
         hint = "Correct that. Then give another --out."
@@ -177,13 +176,13 @@ def _directed(
     gate = MotionGate(None, clock, settings.lost, talk.asked_to_stop, talk.waits)
     with closing(device):
         identity = open_device(device, clock)
-        if record is not None and record.is_measured:
+        if record is not None:
             check_same(setup, record, identity)
         start = setup.judge.first_motion(state_of(device).angles, {}, releases=releases)
         if (start.free or start.hazards) and not talk.may_energise(start):
             raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
         if record is not None:
-            begin(setup, record, identity, talk.say)
+            begin(setup, record, identity)
         scheduler = prepared.scheduler
         drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, NoLog())
         try:
