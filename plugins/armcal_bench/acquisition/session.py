@@ -106,7 +106,8 @@ class Recovery:
         """
         while True:
             try:
-                return blaming(action)()
+                result: T = blaming(action)()
+                return result
             except DeviceUnwellError:
                 raise
             except DeviceError as fault:
