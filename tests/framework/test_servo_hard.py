@@ -13,12 +13,15 @@ import yaml
 from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
 from armcal.devices.device import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
+from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.heat import HeatModel, ThermalState
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.servo.outputs import improved, write_servo_file
 from armcal_bench.servo.record import Record
 from armcal_bench.servo.session import evaluated, measure
 from armcal_bench.servo.setup import Conversation
 
+from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults
 from tests.servo_fakes import CONFIGS, config_in, setup_on
 from tests.servo_runs import SETS, ServoRun, put_rows
@@ -192,6 +195,41 @@ class TestTracker:
             clock.ask({"fault": {"kind": "seen"}})
             run.measure()
         assert len(run.entries("pose")) == 12 and not run.entries("left_out")
+
+    @pytest.mark.slow
+    def test_servos_rest_while_it_is_waited_for(self, run: ServoRun) -> None:
+        heat = ("bench.acquisition.heat={q2: {continuous_Nm: 1.5, winding_time_s: 5, case_time_s: 9, budget: 0.9}}",)
+        setup = run.setup(*heat, "bench.acquisition.lost.park_s=60", "bench.servo.joints=[q2]")
+        rests: list[float] = []
+        stand = Drive.stand
+        with run.run.simulated() as clock, pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Drive, "stand", lambda drive, s, may: (rests.append(s), stand(drive, s, may))[1])
+            clock.ask({"fault": {"kind": "lost", "at": 15}})
+            with pytest.raises(StopRequested, match="nothing of use"):
+                run.measure(setup=setup)
+            assert clock.ask({"state": True})["offences"] == {}
+        assert rests
+
+    @pytest.mark.slow
+    def test_warmth_outlasts_the_program(self, run: ServoRun) -> None:
+        times, shares = np.array([[20.0, 300.0]]), np.array([[0.3, 0.7]])
+        heat = HeatModel(np.array([1.0]), times, shares, np.array([0.48]), lambda pose: 2.0 * np.abs(pose))
+        clock = FakeClock()
+        warm = ThermalState(heat, ("q1",), clock)
+
+        def must_rest() -> bool:
+            return heat.over(warm.warmth)
+
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 0.0)
+        assert must_rest()
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, 3600.0)
+        assert not must_rest()
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 1.0}, 3600.0)
+        assert must_rest()  # it held something heavy meanwhile
+        warm.go_on({"q1": [0.9, 0.5]}, {}, 3600.0)
+        assert not must_rest()  # it hung free
+        warm.go_on({"q1": [0.9, 0.5]}, {"q1": 0.0}, -1e9)
+        assert must_rest()  # by a wall clock that was set back
 
 
 @pytest.mark.slow

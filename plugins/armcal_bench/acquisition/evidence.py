@@ -15,6 +15,7 @@ from armcal_bench.settling import Stand, pose_of
 _ENOUGH = 5
 _SURE, _FEWEST_STANDS = 2.5, 3  # Standard deviations, in each of most stands
 _MINUTE = 60.0
+_LEAST_SPEED = 0.001 / _MINUTE  # m/s: a servo that comes to rest moves so much
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,8 @@ class Drift:
             return None
         rates, sds = (np.array([getattr(stand, name) for stand in stands]) for name in ("rates", "sds"))
         moving = int(np.sum(np.sqrt(np.mean((rates / sds) ** 2, axis=1)) > _SURE))
-        if 2 * moving <= len(stands):
-            return None
-        return cls(float(np.sqrt(np.mean(np.sum(rates**2, axis=1)))), moving)
+        speed = float(np.sqrt(np.mean(np.sum(rates**2, axis=1))))
+        return cls(speed, moving) if 2 * moving > len(stands) and speed > _LEAST_SPEED else None
 
     @property
     def sentence(self) -> str:
