@@ -124,16 +124,22 @@ class Evidence:
         arrival: compares poses with the model's.
         borne: whether a mistake of the tracker's frame ends no run; by default each does.
         fewest: poses that show one.
+        restless_ends: whether poses in a row in which the arm does not come to stand end a run, whatever the reason.
 
     Attributes:
         doubted: what was recorded of poses that do not count as measured, by their index.
     """
 
     def __init__(
-        self, arrival: Arrival, borne: Callable[[FrameMistake], bool] = lambda mistake: False, fewest: int = FEWEST
+        self,
+        arrival: Arrival,
+        borne: Callable[[FrameMistake], bool] = lambda mistake: False,
+        fewest: int = FEWEST,
+        *,
+        restless_ends: bool = False,
     ) -> None:
         self.doubted: dict[int, Mapping[str, Any]] = {}
-        self.arrival, self._borne, self._fewest = arrival, borne, fewest
+        self.arrival, self._borne, self._fewest, self._restless_ends = arrival, borne, fewest, restless_ends
         self._stands: list[tuple[int, Stand]] = []
         self._failed = 0
 
@@ -146,16 +152,20 @@ class Evidence:
         self._failed = 0
         self.doubted.pop(pose, None)
 
-    def failed(self) -> None:
+    def failed(self, why: str) -> None:
         """The arm did not come to stand in a pose, or stood elsewhere.
 
         Raises:
             JointGivesWay: that happened several times in a row, and the target moves meanwhile.
         """
         self._failed += 1
-        drift = self.drift(self._failed) if self._failed >= self.arrival.settings.in_a_row else None
-        if drift is not None:
+        if self._failed < self.arrival.settings.in_a_row:
+            return
+        if (drift := self.drift(self._failed)) is not None:
             raise JointGivesWay(drift.sentence)
+        if self._restless_ends:
+            text = f"the arm did not come to stand {self._failed} times in a row ({why})"
+            raise JointGivesWay(f"{text}: does a servo stall, or let go?")
 
     def drift(self, last: int = 0) -> Drift | None:
         """A motion of the target in the last so many stands, or in all of them."""

@@ -272,7 +272,7 @@ class AcquisitionRun:
         if isinstance(settled, str):
             self._try_later(step.pose, settled)
             self._check_frame()
-            self._evidence.failed()
+            self._evidence.failed(settled)
         else:
             self._accept(step.pose, settled)
 
@@ -321,7 +321,7 @@ class AcquisitionRun:
         if doubt:
             self._astray += 1
             self._try_later(pose, doubt)
-            self._evidence.failed()
+            self._evidence.failed(doubt)
             if self._astray >= self._settings.arrival.in_a_row:
                 raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return

@@ -111,15 +111,13 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
     """Drive the sweeps that are left as a measuring run; the arm ends in its base pose."""
     device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
     poses: dict[str, tuple[dict[str, float], dict[str, int]]] = {}
-    planned: dict[str, list[str]] = {}
+    planned: dict[str, list[str]] = {joint: [] for joint in setup.joints}
     for joint in setup.joints:
         for counts, came in sweep(setup, device, joint):
             name, side = pose_name(joint, counts, came), came if device.rises(joint) else -came
             poses[name] = {joint: device.angle(joint, counts)}, {joint: side}
-            planned.setdefault(joint, []).append(name)
+            planned[joint].append(name)
     log, first = SweepLog(record), len(record.entries)
-    if set(poses) <= set(log.progress.measured):
-        return
 
     def report(progress: Progress) -> None:
         over = {*progress.measured, *progress.left_out}
@@ -134,9 +132,14 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         check_same(setup, record, identity)
         _check_cools(setup)
 
+    if set(poses) <= set(log.progress.measured):
+        with closing(device):
+            check(open_device(device, clock))
+        return
     prepared, options = setup.run(device, poses), talk.options(report)
     with opened(prepared, options, clock, check) as (gate, identity):
-        run = ready_run(prepared, options, log, gate, identity, Evidence(prepared.arrival, is_borne))
+        evidence = Evidence(prepared.arrival, is_borne, restless_ends=True)
+        run = ready_run(prepared, options, log, gate, identity, evidence)
         begin(setup, record, identity)
         ending = run.run()
     if ending.how == "refused":
