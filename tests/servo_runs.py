@@ -19,8 +19,8 @@ from armcal.io.journal import JOURNAL, Journal
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.rehearsal import overrides_for
 from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import Conversation, evaluated, measure
-from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.session import evaluated, measure
+from armcal_bench.servo.setup import Conversation, Setup
 
 from tests.bench_runs import BenchRun, _in_child, _wait, free_port
 from tests.servo_fakes import CONFIGS
@@ -99,7 +99,7 @@ class ServoRun:
     def pulses(self) -> dict[str, np.ndarray]:
         """Those found (us), by joint."""
         outcome = evaluated(self.setup(), self.out)
-        return {joint: 1e6 * np.array(servo.pulses) for joint, servo in outcome.fit.servos.items()}
+        return {joint: 1e6 * np.array(servo.pulses) for joint, servo in outcome.servos.items()}
 
     def entries(self, kind: str) -> list[Any]:
         """Of the record, of a kind."""

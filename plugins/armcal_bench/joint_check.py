@@ -3,33 +3,38 @@
 A check is a short measuring run from where the arm stands: each joint turns a little and back.
 """
 
-import csv
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
+from armcal.arm.assembly import Arm
 from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
-from armcal.devices.device import MeasuringDevice, measured_angles, open_device
+from armcal.base.dataset import Dataset
+from armcal.base.poses import NO_TURN
+from armcal.devices.clock import Clock
+from armcal.devices.device import DeviceIdentity, MeasuringDevice, measured_angles, open_device
 from armcal.devices.wiring import WiringRecord
-from armcal.errors import ConfigError
-from armcal.io.journal import KeptJournal
+from armcal.errors import ConfigError, InputError
 from armcal.run.experiment import Experiment
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
-from armcal_bench.acquisition.preparation import Prepared, prepare, run_limits
-from armcal_bench.acquisition.run_log import measured_by, progress_of
+from armcal_bench.acquisition.drive import PathPlanner
+from armcal_bench.acquisition.evidence import Evidence
+from armcal_bench.acquisition.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
+from armcal_bench.acquisition.run_log import NoLog, Progress, measured_by
+from armcal_bench.acquisition.session import Ending, opened, ready_run
+from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.bench import SECTION, Bench, closing
-from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.measured_frame import FEWEST, FrameMistake
+from armcal_bench.servo.rigid_arm import RigidArm
+from armcal_bench.servo.setup import ANYWHERE, Conversation
+from armcal_bench.servo.sighting import BODY, TABLES, Body, BodyFit, By, Corrections, Seen
 from armcal_bench.servo.trial import Move, Verdict, judged, noted
-from armcal_bench.settling import pose_of
 
 _TURNS_DEG = (12.0, -12.0, 6.0, -6.0)
-_BASE = "base"
+BASE = "base"
+IN_BASE = "the arm is commanded to hold its base pose"
 _LEVER_M, _MODEL_SD_M, _ZERO_SD, _TARGET_SD_M = 0.1, 0.004, math.radians(15.0), 0.01
 """Of the pose of an arm that sags and is not as drawn; of its zeros; of where the tracker's body sits."""
 """Of the splines of hobby and bus servos."""
@@ -106,101 +111,158 @@ class JointCheck:
         return [*filter(None, lines), *([_TELLS.format(joints=", ".join(unsure))] if unsure else [])]
 
 
-def check_joints(
-    loaded: Callable[[tuple[str, ...]], Experiment], folder: Path, drive: Callable[[Prepared, Path, Path], object]
-) -> JointCheck:
-    """Turn each joint a little, from where the arm stands, and write down which are checked.
+@dataclass(frozen=True)
+class Turned:
+    """What was seen of joints that turned a little."""
+
+    identity: DeviceIdentity
+    moves: Sequence[Move]
+    unseen: Sequence[Verdict]  # of joints that were not seen to stand
+    measured: Mapping[str, Array]  # ``base_T_target`` by pose (4 x 4, m)
+    mistake: FrameMistake | None  # of the tracker's frame
+
+    def judged(self, base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
+        """What each joint did, from a pose (rad by joint).
+
+        Raises:
+            InputError: not every joint turned as commanded, and the tracker's frame is another one than expected:
+                reversed servos resemble a left-handed one.
+        """
+        verdicts = [*(judged(self.moves, base, nominal) if self.moves else []), *self.unseen]
+        if self.mistake is None or all(verdict.kind == "right" for verdict in verdicts):
+            return verdicts
+        reversed_ones = "Or servos of several joints are reversed: look which way each turns."
+        hint = f"{self.mistake.mend} {reversed_ones if self.mistake.frame.is_mirrored else ''}".rstrip()
+        raise InputError(f"{self.mistake.sentence}.", hint=hint)
+
+
+def between(poses: Mapping[str, Mapping[str, float]]) -> dict[str, Mapping[str, float]]:
+    """Poses by joint, each after the one from which that joint turns."""
+    pairs = [((f"{BASE} {joint}", dict[str, float]()), (joint, turned)) for joint, turned in poses.items()]
+    return {name: pose for pair in pairs for name, pose in pair}
+
+
+def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conversation, clock: Clock) -> Turned:
+    """Drive the poses of ``between`` as a measuring run; ``turns`` are those of the joints (rad).
+
+    Raises:
+        InputError: the board or the tracker is refused, or the tracker gives other units than expected.
+        StopRequested: it was stopped before its end.
+    """
+    log, options, ids = NoLog(), talk.options(), prepared.scheduler.ids
+    evidence = Evidence(prepared.arrival, lambda mistake: mistake.frame.is_mirrored, 2 * FEWEST)
+    with opened(prepared, options, clock, lambda identity: None) as (gate, identity):
+        run = ready_run(prepared, options, log, gate, identity, evidence)
+        ending, seen = run.run(), run.known
+    if ending.how == "refused":
+        raise InputError(f"{ending.sentence}.", hint="Correct that, and check again.")
+    check_ended(ending, log.progress, len(ids))
+    measured = {ids[place]: pose for place, pose in seen.items()}
+    moves, unseen = [], []
+    for joint, turn in turns.items():
+        missing = next((name for name in (f"{BASE} {joint}", joint) if name not in measured), None)
+        if missing is None:
+            moves.append(Move(joint, turn, measured[f"{BASE} {joint}"], measured[joint]))
+        else:
+            why = log.progress.left_out.get(missing, "it was not measured")
+            unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
+    return Turned(identity, moves, unseen, measured, evidence.mistake(seen))
+
+
+def check_ended(ending: Ending, progress: Progress, total: int) -> None:
+    """Whether a run through so many poses came to its end.
+
+    Raises:
+        StopRequested: it did not.
+    """
+    is_over = len(progress.measured) + len(progress.left_out) >= total
+    if ending.how == "held":
+        raise StopRequested(ending.sentence, ending.arm)
+    if ending.how == "parked" or (ending.how == "failed" and not is_over):
+        raise StopRequested(ending.sentence, IN_BASE)
+
+
+def check_joints(experiment: Experiment, talk: Conversation) -> JointCheck:
+    """Turn each joint of servos that know where they stand a little, and write down which are checked.
 
     A zero that is far off makes limits and clearances wrong by as much: such a joint does not count as checked.
-
-    Args:
-        loaded: the experiment, with further overrides.
-        folder: an empty one.
-        drive: does the run of a plan, in a folder.
 
     Raises:
         ConfigError: the device does not know where its joints stand, or the arm stands beyond a limit or too near to
             something.
-        InputError: it cannot be written down.
+        InputError: it cannot be written down. See ``turned_a_little`` for more.
     """
-    here, seen = _measured(loaded(()))
-    park = ", ".join(f"{joint}: {math.degrees(angle):.4f} deg" for joint, angle in here.items())
-    at = f"{SECTION}.acquisition"
-    wide = (f"{at}.arrival.astray_mm=5000", f"{at}.arrival.astray_turned_deg=180")
-    experiment = loaded((f"{at}.park={{{park}}}", *wide))
-    plan = folder / "check.csv"
-    base = prepare(experiment, _written(plan, list(here), {_BASE: list(here.values())}))
-    poses = {_BASE: base.scheduler.park}
-    for i, joint in enumerate(here):
-        for turn in np.deg2rad(_TURNS_DEG):
-            turned = base.scheduler.park + turn * np.eye(len(here))[i]
-            if base.scheduler.planner.within(turned) and base.scheduler.planner.clear(base.scheduler.park, turned):
-                poses[joint] = turned
-                break
-    prepared = prepare(experiment, _written(plan, list(here), poses))
-    drive(prepared, plan, folder / "run")
-    with KeptJournal(folder / "run") as journal:
-        measured = {name: pose_of(record) for name, record in progress_of(journal.entries()).measured.items()}
-    commanded = dict(zip(prepared.plan.ids, prepared.scheduler.poses, strict=True))
-    check = _judged(experiment, list(here), commanded, measured)
-    far = {joint for joint, zero in check.zeros.items() if zero.is_far}
-    counted = [replace(v, kind="unclear") if v.joint in far else v for v in check.verdicts]
-    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
-    return check
-
-
-def _measured(experiment: Experiment) -> tuple[dict[str, float], dict[str, Any]]:
-    """Where the joints stand (rad), within their limits; on which adapter, when, and by what they are checked."""
     bench = Bench.of(experiment)
-    device = bench.device()
+    own = bench.settings.acquisition.model_copy(update={"arrival": ANYWHERE})
+    device, arm = bench.device(), bench.arm
     if not isinstance(device, MeasuringDevice):
         text = "found a device whose servos do not know where they stand, and no servo file."
         hint = "Name the servo file in bench.device.servos."
         raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
-    with bench.clock() as clock, closing(device):
-        adapter, here = open_device(device, clock).adapter, measured_angles(device)
-        seen = {"adapter": adapter, "by": "tracker", "at": clock.wall()}
-    limits = run_limits(experiment, bench.settings.acquisition, bench.arm)
-    ends = dict(zip(bench.arm.commanded, limits.tolist(), strict=True))
-    return {joint: min(max(here[joint], low), high) for joint, (low, high) in ends.items()}, seen
+    limits, joints = run_limits(experiment, own, arm), tuple(arm.commanded)
+    nominal = RigidArm(arm, experiment.parameters)
+    with bench.clock() as clock:
+        with closing(device):
+            open_device(device, clock)
+            here = measured_angles(device)
+        base = np.clip([here[joint] for joint in joints], limits[:, 0], limits[:, 1])
+        park = dict(zip(joints, base.tolist(), strict=True))
+        own = own.model_copy(update={"park": park})
+        planner = PathPlanner(clearance_of(experiment, arm), limits, base[None], own.path_step)
+        check_park(experiment, planner, heat_of(experiment, own, arm), base, joints)
+        turns: dict[str, float] = {}
+        for i, joint in enumerate(joints):
+            for turn in np.deg2rad(_TURNS_DEG).tolist():
+                turned = base + turn * np.eye(len(joints))[i]
+                if planner.within(turned) and planner.clear(base, turned):
+                    turns[joint] = turn
+                    break
+        steps = between({joint: {joint: park[joint] + turn} for joint, turn in turns.items()})
+        angles = np.array([[{**park, **pose}[joint] for joint in joints] for pose in steps.values()])
+        plan = Dataset(tuple(steps), {})
+        prepared = of_poses(bench, own, device, plan, angles, np.zeros_like(angles), limits, base)
+        turned_ones = turned_a_little(prepared, turns, talk, clock)
+        at = clock.wall()
+    check = _judged(experiment, arm, park, dict(zip(steps, angles, strict=True)), turned_ones, nominal)
+    far = {joint for joint, zero in check.zeros.items() if zero.is_far}
+    counted = [replace(v, kind="unclear") if v.joint in far else v for v in check.verdicts]
+    seen = {"adapter": turned_ones.identity.adapter, "by": "tracker", "at": at}
+    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
+    return check
 
 
 def _judged(
-    experiment: Experiment, joints: list[str], commanded: Mapping[str, Array], measured: Mapping[str, Array]
+    experiment: Experiment,
+    arm: Arm,
+    base: Mapping[str, float],
+    commanded: Mapping[str, Array],
+    turned: Turned,
+    nominal: RigidArm,
 ) -> JointCheck:
-    bench = Bench.of(experiment)
-    nominal = NominalArm.of(bench.arm, experiment.parameters, experiment.system.environment)
-    base = dict(zip(joints, commanded[_BASE].tolist(), strict=True))
-    seen = [joint for joint in joints if joint in measured and _BASE in measured]
-    moves = [
-        Move(joint, float(commanded[joint][i] - commanded[_BASE][i]), measured[_BASE], measured[joint])
-        for i, joint in enumerate(joints)
-        if joint in seen
-    ]
-    verdicts = _verdicts(moves, base, nominal)
+    joints = list(base)
+    verdicts = turned.judged(base, nominal)
     zeros: dict[str, Zero] = {}
-    if len(seen) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
-        names = [_BASE, *joints]
-        poses = np.array([commanded[name] for name in names]), np.array([measured[name] for name in names])
+    if len(turned.moves) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
+        names = list(turned.measured)
+        poses = np.array([commanded[name] for name in names]), np.array([turned.measured[name] for name in names])
         scope, stated = measured_by(experiment)[0], experiment.parameters
         axes = [f"{scope}.target_{axis}" for axis in "xyz"]
         target = np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in axes])
-        zeros = _zeros(nominal, joints, poses, target)
+        zeros = _zeros(experiment, arm, joints, poses, target)
         # a zero that is far off turns the axes of the joints after it away from the model's
-        verdicts = _verdicts(moves, {joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
+        verdicts = turned.judged({joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
+    verdicts = [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
+    named = {verdict.joint for verdict in verdicts}
     for joint in joints:
-        if joint not in seen:
-            sentence = f"{joint} was not measured: nowhere to turn to, or the tracker did not see it."
+        if joint not in named:
+            sentence = f"{joint} was not measured: there is nowhere to turn to."
             verdicts.append(Verdict(joint, "unclear", sentence, "Begin from a pose with more room about it."))
     return JointCheck(verdicts, zeros if all(verdict.kind == "right" for verdict in verdicts) else {})
 
 
-def _verdicts(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> list[Verdict]:
-    verdicts = judged(moves, base, nominal) if moves else []
-    return [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
-
-
-def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], target: Array) -> dict[str, Zero]:
+def _zeros(
+    experiment: Experiment, arm: Arm, joints: list[str], poses: tuple[Array, Array], target: Array
+) -> dict[str, Zero]:
     """How much the joints' angles are to be enlarged by.
 
     Args:
@@ -208,31 +270,17 @@ def _zeros(nominal: NominalArm, joints: list[str], poses: tuple[Array, Array], t
         target: as stated (3, m, tool frame).
     """
     commanded, measured = poses
-    count, turned = len(joints), not np.isnan(measured[:, :3, :3]).any()
-
-    def residuals(x: Array) -> Array:
-        angles = commanded + x[:count]
-        tools = nominal.tools([dict(zip(joints, row, strict=True)) for row in angles.tolist()])
-        parts = [(tools[:, :3, :3] @ x[count:] + tools[:, :3, 3] - measured[:, :3, 3]).ravel()]
-        if turned:
-            off = Rotation.from_matrix(tools[:, :3, :3].transpose(0, 2, 1) @ measured[:, :3, :3]).as_rotvec()
-            parts.append(_LEVER_M * off.ravel())
-        return np.concatenate(
-            [*(p / _MODEL_SD_M for p in parts), x[:count] / _ZERO_SD, (x[count:] - target) / _TARGET_SD_M]
-        )
-
-    start = np.concatenate([np.zeros(count), target])
-    fit = least_squares(residuals, start, x_scale=0.1)
-    jacobian = np.asarray(fit.jac)
-    sds = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))  # the priors keep it regular
-    return {joint: Zero(float(fit.x[i]), float(sds[i])) for i, joint in enumerate(joints)}
-
-
-def _written(path: Path, joints: list[str], poses: Mapping[str, Sequence[float] | Array]) -> Path:
-    """A plan of poses (rad)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["pose_id", *(f"{joint}_deg" for joint in joints)])
-        writer.writerows([name, *np.rad2deg(pose).tolist()] for name, pose in poses.items())
-    return path
+    numbers = {joint: arm.joint_names.index(joint) + 1 for joint in joints}
+    names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers.values()]
+    places = [f"{BODY}.seat_{axis}" for axis in "xyz"]
+    free = {**dict.fromkeys(names, _ZERO_SD), **dict.fromkeys(places, _TARGET_SD_M)}
+    by: By = "position" if np.isnan(measured[:, :3, :3]).any() else "pose"
+    count = len(measured)
+    angles = dict(zip(joints, commanded.T, strict=True))
+    turns, lengths = np.full(count, _MODEL_SD_M / _LEVER_M), np.full(count, _MODEL_SD_M)
+    seen = Seen(angles, measured, turns, place_noise=lengths)
+    body = Body((arm.name,), by, NO_TURN, tuple(target.tolist()))
+    fit = BodyFit(experiment, arm, Corrections({}, list(numbers.values()), ()), body, free, seen)
+    fit.fit(seen, np.ones(count))
+    sds = fit.deviations(names).tolist()
+    return {joint: Zero(fit.value(name), sd) for joint, name, sd in zip(joints, names, sds, strict=True)}

@@ -1,43 +1,33 @@
-"""What a person types, by single keys of a terminal or by lines of a pipe: for recordings and servo calibrations."""
+"""What the operator types, as one queue of words: single keys of a terminal, or lines of a pipe."""
 
+import codecs
 import os
-import re
 import select
 import termios
 import tty
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from typing import Protocol
 
 from armcal.io.lines import LineCutter
-from typing_extensions import override
 
 _LONGEST = 1024
-END = "q"
-_END_OF_INPUT, _ERASE, _ESCAPE = "\x04", "\x7f\b", "\x1b"
-QUIT = "quit"
-_WISHES = {
-    b"\x1b[A": "+1",
-    b"\x1b[B": "-1",
-    b"\x1bOA": "+1",
-    b"\x1bOB": "-1",
-    b"\x1b[5~": "+10",
-    b"\x1b[6~": "-10",
-    b"+": "+1",
-    b"-": "-1",
-    b"\r": "ok",
-    b"\n": "ok",
-    b"s": "skip",
-    b"b": "back",
-    b"q": QUIT,
-    b"\x03": QUIT,
-    b"\x04": QUIT,
-    b"y": "y",
-    b"r": "r",
-    b"o": "o",
-    b"n": "n",
+END, QUIT = "q", "quit"
+_END_OF_INPUT, _ERASE, _ESCAPE, _ENTER = "\x04", "\x7f\b", "\x1b", "\r\n"
+SERVO_KEYS: Mapping[str, str] = {
+    **dict.fromkeys(("\x1b[A", "\x1bOA", "+"), "+1"),
+    **dict.fromkeys(("\x1b[B", "\x1bOB", "-"), "-1"),
+    **{"\x1b[5~": "+10", "\x1b[6~": "-10", "\r": "ok", "\n": "ok", "s": "skip", "b": "back"},
+    **dict.fromkeys(("q", "\x03", "\x04"), QUIT),
+    **{answer: answer for answer in "yron"},
 }
-_WISH = re.compile(b"|".join(map(re.escape, sorted(_WISHES, key=len, reverse=True))))
+"""Of a guided servo calibration: steps in microseconds, what becomes of a point, and answers."""
+RECORDING_KEYS: Mapping[str, str] = {
+    **{chr(code): chr(code) for code in range(0x21, 0x7F) if chr(code) != "g"},
+    **{"\r": "c", "\n": "c", _END_OF_INPUT: END},
+}
+"""Of a recording, whose key ``g`` begins a name."""
+_NAME = "g"
 
 
 @contextmanager
@@ -51,19 +41,58 @@ def single_keys(descriptor: int) -> Iterator[None]:
             termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
 
-class Typed:
-    """What a person types at a descriptor.
+class OperatorInput:
+    """Words in the order in which they are typed.
+
+    Args:
+        descriptor: of a terminal (in the mode of ``single_keys``) or a pipe; None: nobody can type.
+        keys: of a terminal, what each key stands for; None: a word a line.
+        at_end: the word that the end of the input stands for, if any.
+        echo: shows text where a name is typed; None: no key begins a name.
 
     Attributes:
         ended: nothing will ever come again.
     """
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor, self.ended = descriptor, False
+    def __init__(
+        self,
+        descriptor: int | None,
+        keys: Mapping[str, str] | None = None,
+        at_end: str | None = None,
+        echo: Callable[[str], None] | None = None,
+    ) -> None:
+        self._descriptor, self._keys, self._at_end, self._echo = descriptor, keys, at_end, echo
+        self.ended = descriptor is None
+        self._words: deque[str] = deque()
+        self._cutter, self._has_part = LineCutter(_LONGEST), False
+        self._decoder, self._pressed = codecs.getincrementaldecoder("utf-8")("replace"), ""
+        self._name: str | None = None
+        """What was typed of a name; None while none is typed."""
 
-    def read(self, seconds: float = 0.0) -> bytes:
-        """What comes in so many real seconds; empty if nothing does."""
-        if self.ended or not select.select([self._descriptor], [], [], seconds)[0]:
+    def next(self, seconds: float = 0.0) -> str | None:
+        """The next word; None if none came in so many real seconds."""
+        while not self._words:
+            data = self._read(seconds)
+            if data and self._keys is None:
+                self._cut(data)
+            elif data:
+                self._press(self._decoder.decode(data))
+            else:
+                self._pressed = ""  # an escape with nothing after it is no key
+                if self.ended and self._has_part:
+                    self._cut(b"\n")
+                    continue
+                return self._at_end if self.ended else None
+        return self._words.popleft()
+
+    def _read(self, seconds: float) -> bytes:
+        if self._descriptor is None or self.ended:
+            return b""
+        if self._keys is not None:  # after a stop and a continuation the shell has set the terminal its own way
+            with suppress(termios.error):
+                if termios.tcgetattr(self._descriptor)[3] & termios.ICANON:
+                    tty.setcbreak(self._descriptor, termios.TCSANOW)
+        if not select.select([self._descriptor], [], [], seconds)[0]:
             return b""
         try:
             data = os.read(self._descriptor, _LONGEST)
@@ -72,150 +101,53 @@ class Typed:
         self.ended = not data
         return data
 
-    def keep_single_keys(self) -> None:
-        """Of a terminal: after a stop and a continuation the shell has set it its own way."""
-        with suppress(termios.error):
-            if termios.tcgetattr(self._descriptor)[3] & termios.ICANON:
-                tty.setcbreak(self._descriptor, termios.TCSANOW)
+    def _cut(self, data: bytes) -> None:
+        lines = self._cutter.feed(data)
+        self._words += [line.decode("utf-8", "replace") for line in lines if line is not None]
+        self._has_part = not data.endswith(b"\n")
 
+    def _press(self, text: str) -> None:
+        """Take keys as far as they are whole; what is no key is passed over."""
+        assert self._keys is not None
+        self._pressed += text
+        while self._pressed:
+            if self._name is not None or (self._echo is not None and self._pressed[0] == _NAME):
+                self._letter(self._pressed[0])
+                self._pressed = self._pressed[1:]
+                continue
+            match = next(
+                (key for key in sorted(self._keys, key=len, reverse=True) if self._pressed.startswith(key)), ""
+            )
+            if match:
+                self._words.append(self._keys[match])
+            elif any(key.startswith(self._pressed) for key in self._keys):
+                return
+            self._pressed = self._pressed[max(len(match), 1) :]
 
-class Keys(Protocol):
-    """Commands as ``Recorder.command`` takes them."""
-
-    ended: bool  # Whether there will never be another one
-
-    def commands(self) -> list[str]:
-        """All that came since the last call; it never waits."""
-
-
-class NoKeys(Keys):
-    """Nobody can type."""
-
-    ended = True
-
-    @override
-    def commands(self) -> list[str]:
-        return []
-
-
-class LineKeys(Typed, Keys):
-    """A command a line, from a pipe."""
-
-    def __init__(self, descriptor: int) -> None:
-        super().__init__(descriptor)
-        self._cutter = LineCutter(_LONGEST)
-
-    @override
-    def commands(self) -> list[str]:
-        lines: list[bytes | None] = []
-        while data := self.read():
-            lines += self._cutter.feed(data)
-        return [line.decode("utf-8", "replace") for line in lines if line is not None]
-
-
-class TerminalKeys(Typed, Keys):
-    """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in.
-
-    Args:
-        descriptor: of the terminal.
-        echo: shows text where a name is typed.
-    """
-
-    def __init__(self, descriptor: int, echo: Callable[[str], None]) -> None:
-        super().__init__(descriptor)
-        self._echo = echo
-        self._name: str | None = None
-        """What was typed of a name; None while none is typed."""
-
-    @override
-    def commands(self) -> list[str]:
-        self.keep_single_keys()
-        typed = b""
-        while data := self.read():
-            typed += data
-        pressed = [self._pressed(key) for key in typed.decode("utf-8", "replace")]
-        return [command for command in pressed if command is not None]
-
-    def _pressed(self, key: str) -> str | None:
-        """The command that a key completes, or a letter of a name."""
-        name = self._name
+    def _letter(self, key: str) -> None:
+        """A letter of a name, its begin or its end."""
+        name, echo = self._name, self._echo or (lambda text: None)
         if name is None:
-            if key == "g":
-                self._name = ""
-                self._echo("name: ")
-            elif key in "\r\n" or key == _END_OF_INPUT:
-                return "c" if key in "\r\n" else END
-            elif key.isprintable() and not key.isspace():
-                return key
-            return None
-        if key in "\r\n" or key in (_ESCAPE, _END_OF_INPUT):
+            self._name = ""
+            echo("name: ")
+        elif key in _ENTER or key in (_ESCAPE, _END_OF_INPUT):
             self._name = None
-            self._echo("\n")
-            return f"g {name}" if key in "\r\n" and name.strip() else None
-        if key in _ERASE:
+            echo("\n")
+            if key in _ENTER and name.strip():
+                self._words.append(f"{_NAME} {name}")
+        elif key in _ERASE:
             self._name = name[:-1]
-            self._echo("\b \b" if name else "")
+            echo("\b \b" if name else "")
         elif key.isprintable():
             self._name = name + key
-            self._echo(key)
-        return None
-
-
-class Wishes(Protocol):
-    """Where wishes come from."""
-
-    def next(self, seconds: float) -> str | None:
-        """The next wish: a number of microseconds with its sign, ``ok``, ``skip``, ``back``, ``quit`` or an answer.
-
-        None if none came in so many real seconds. The end of the input is ``quit``.
-        """
-
-
-class WishKeys(Typed, Wishes):
-    """Single keys of a terminal; see ``terminal.single_keys`` for the mode that it must be in."""
-
-    _read = b""
-
-    @override
-    def next(self, seconds: float) -> str | None:
-        self.keep_single_keys()
-        while True:
-            while self._read:
-                if key := _WISH.match(self._read):
-                    self._read = self._read[key.end() :]
-                    return _WISHES[key[0]]
-                if any(key.startswith(self._read) for key in _WISHES):
-                    break
-                self._read = self._read[1:]  # what is no key is passed over
-            more = self.read(seconds)
-            if not more:
-                self._read = b""  # an escape with nothing after it is no key
-                return QUIT if self.ended else None
-            self._read += more
-
-
-class WishLines(Typed, Wishes):
-    """A wish a line, for scripts."""
-
-    _read = b""
-
-    @override
-    def next(self, seconds: float) -> str | None:
-        while b"\n" not in self._read and not self.ended:
-            more = self.read(seconds)
-            if not more and not self.ended:
-                return None
-            self._read += more
-        line, end, self._read = self._read.partition(b"\n")
-        said = line.decode("utf-8", "replace").strip().lower()
-        return said or (self.next(seconds) if end else QUIT)
+            echo(key)
 
 
 @contextmanager
-def wishes_from(descriptor: int) -> Iterator[Wishes]:
-    """Keys where a terminal is, whose mode is put back whatever happens; else lines."""
+def servo_input(descriptor: int) -> Iterator[OperatorInput]:
+    """For a guided calibration: keys where a terminal is, whose mode is put back whatever happens; else lines."""
     if not os.isatty(descriptor):
-        yield WishLines(descriptor)
+        yield OperatorInput(descriptor, at_end=QUIT)
         return
     with single_keys(descriptor):
-        yield WishKeys(descriptor)
+        yield OperatorInput(descriptor, SERVO_KEYS, QUIT)

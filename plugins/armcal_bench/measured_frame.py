@@ -95,17 +95,6 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
     return _mistake(best, len(seen))
 
 
-def frame_of(expected: Array, seen: Array) -> MeasuredFrame | None:
-    """In which frame, with lengths as they should be, measured poses are those of the model; None where it is not one.
-
-    See ``frame_mistake``.
-    """
-    if len(seen) < FEWEST:
-        return None
-    frame = _fitted(expected, seen, _Reading(1.0, with_rotations=True))
-    return frame if frame.left <= FITS * spread_of(expected[:, :3, 3].T) else None
-
-
 _BOTH = (True, False)
 
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.devices.live import TrackerFrame
-from armcal.measure.rests import deviations_of_mean, judged, mean_pose, turns_from
-from scipy.spatial.transform import Rotation
+from armcal.measure.rests import deviations_of_mean, judged, mean_pose
 
 from armcal_bench.acquisition.settings import SettleSettings
 from armcal_bench.bench import BodySettings, in_base, repeats
@@ -19,7 +18,7 @@ _MOST_FRAMES = 20_000
 _GAP = 0.25  # A part of the window that may pass without a usable frame
 _SLACK_S = 1e-9
 _LONGEST_STAND_S, _FEWEST = 30.0, 4
-_LEAST_RATE = 1e-7  # m/s and rad/s: what is rounded more coarsely than its noise has no deviation
+_LEAST_RATE = 1e-7  # m/s: what is rounded more coarsely than its noise has no deviation
 
 
 @dataclass(frozen=True)
@@ -51,9 +50,8 @@ class Stand:
     """How the target moved while the arm was commanded to stand."""
 
     base_T_target: Array  # in the middle of that time (4 x 4, m); the rotation is NaN where it is not known
-    rates: Array  # along x, y, z (m/s) and about x, y, z (rad/s) of the base frame; NaN where the rotation is not known
+    rates: Array  # along x, y, z of the base frame (m/s)
     sds: Array  # standard deviations of these
-    seconds: float  # how long it was seen
 
 
 def pose_of(record: Mapping[str, Any]) -> Array:
@@ -65,7 +63,7 @@ def pose_of(record: Mapping[str, Any]) -> Array:
 
 
 class Settling:
-    """Judges by frames whether the arm stands. See ``stillness.judged`` for what that means."""
+    """Judges by frames whether the arm stands. See ``armcal.measure.rests.judged`` for what that means."""
 
     def __init__(self, settings: SettleSettings, bodies: BodySettings) -> None:
         self._settings = settings
@@ -144,22 +142,15 @@ class Settling:
 
 
 def drift_of(times: Array, poses: Array) -> Stand | None:
-    """By straight lines of least squares through poses (N x 4 x 4, m) at times (N, s, rising); None for one moment."""
-    middle, mean = times - times.mean(), mean_pose(poses)
-    weights = middle / max(float(middle @ middle), 1e-12)
-    span = float(times[-1] - times[0])
+    """By straight lines of least squares through positions of poses (N x 4 x 4, m) at times (N, s, rising).
+
+    None for one moment.
+    """
+    middle, mean, span = times - times.mean(), mean_pose(poses), float(times[-1] - times[0])
     if span <= 0:
         return None
-    rates = np.full(6, np.nan)
-    rates[:3] = weights @ poses[:, :3, 3]
-    moved = poses.copy()
-    moved[:, :3, 3] -= np.outer(middle, rates[:3])
-    if not np.isnan(poses[:, 0, 0]).any():
-        rotation = mean[:3, :3]
-        in_target = weights @ turns_from(rotation, poses[:, :3, :3])
-        rates[3:] = rotation @ in_target
-        moved[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(-np.outer(middle, in_target)).as_matrix()
-    sds = deviations_of_mean(moved, mean) * np.sqrt(12.0) / span  # of a slope, from that of a mean
-    if not np.isnan(rates[3:]).any():
-        sds[3:] = np.sqrt(np.diag(mean[:3, :3] @ np.diag(sds[3:] ** 2) @ mean[:3, :3].T))
-    return Stand(mean, rates, np.maximum(sds, _LEAST_RATE), span)
+    rates = middle @ poses[:, :3, 3] / float(middle @ middle)
+    level = poses.copy()
+    level[:, :3, 3] -= np.outer(middle, rates)
+    sds = deviations_of_mean(level, mean)[:3] * np.sqrt(12.0) / span  # of a slope, from that of a mean
+    return Stand(mean, rates, np.maximum(sds, _LEAST_RATE))

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from armcal.devices.device import DeviceError, DeviceLostError, DeviceUnwellError
+from armcal.devices.device import DeviceError, DeviceIdentity, DeviceLostError, DeviceUnwellError
 from armcal_bench.acquisition.drive import Drive, PathPlanner
 from armcal_bench.acquisition.heat import HeatModel
 from armcal_bench.acquisition.run_log import Progress
@@ -347,3 +347,19 @@ def test_a_servo_that_is_too_hot_parks_the_arm_and_lets_it_go() -> None:
     assert not run.device.running and "66 deg C" in run.log.entries[-1][1]["sentence"]
     last = [angles for _, what, angles in run.device.log if what == "command"][-1]
     assert last == pytest.approx({"q1": 0.0, "q2": 0.0}, abs=COUNT_RAD)
+
+
+def test_another_board_that_is_plugged_in_meanwhile_is_not_moved(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Run()
+
+    def unplug() -> None:
+        run.device.gone = True
+
+    def plug_another_in() -> None:
+        run.device.gone = False
+        monkeypatch.setattr(run.device, "open", lambda clock: DeviceIdentity("another", "d1"))
+
+    run.clock.at += [(8.0, unplug), (9.0, plug_another_in)]
+    assert run.run() == "held"
+    assert "found another, expected fake" in run.log.entries[-1][1]["sentence"]
+    assert max(t for t, what, _ in run.device.log if what != "release") <= 8.0

@@ -95,24 +95,24 @@ class TestAFrameThatIsNotTheArms:
 
 
 class TestAJointThatGivesWay:
-    def test_one_that_no_pose_settles_with_is_named_and_the_run_failed(self, tmp_path: Path) -> None:
+    def test_it_is_said_where_no_pose_settles_with_it_and_the_run_failed(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 100})
         with arm.run.simulated():
             code, said = acquired(arm, "--set", "bench.acquisition.settle.longest_s=4")
-        assert code == 1 and re.search(r"failed: lift .*sinks by [23]\d deg/min while it should stand", said)
-        assert "Look at the screw of lift's horn" in said and "done" not in said
+        assert code == 1 and re.search(r"failed: the target moves by \d+ mm/min while the arm should stand", said)
+        assert "Look at the screws of the horns" in said and "done" not in said
 
     @pytest.mark.slow
-    def test_one_that_is_too_slow_to_keep_poses_from_settling_is_named_at_the_end(self, tmp_path: Path) -> None:
-        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 10})
+    def test_it_is_said_at_the_end_where_it_is_too_slow_to_keep_poses_from_settling(self, tmp_path: Path) -> None:
+        arm = OwnArm(tmp_path, TOWER, **{"bench.simulator.joints.lift.creep_deg_per_min": 40})
         with arm.run.simulated():
             code, said = acquired(arm)
-        assert code == 3 and re.search(r"done: .*warning: lift sinks by [345]\.?\d* deg/min", said)
+        assert code == 3 and re.search(r"done: .*warning: the target moves by \d+ mm/min while", said)
         gives_way = json.loads((arm.out / "summary.json").read_text())["gives_way"]
-        assert gives_way["joints"] == ["lift"] and 5 < gives_way["mm_per_min"] < 30
+        assert gives_way["poses"] >= 3 and 20 < gives_way["mm_per_min"] < 120
 
     @pytest.mark.slow
-    def test_none_is_named_where_none_does(self, tmp_path: Path) -> None:
+    def test_nothing_is_said_where_none_does(self, tmp_path: Path) -> None:
         arm = OwnArm(tmp_path, TOWER)
         with arm.run.simulated():
             code, said = acquired(arm)

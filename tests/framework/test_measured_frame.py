@@ -11,10 +11,11 @@ from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.run.experiment import Experiment
-from armcal_bench.bench import Bench
-from armcal_bench.measured_frame import frame_mistake, frame_of
-from armcal_bench.servo.nominal import NominalArm
+from armcal_bench.measured_frame import frame_mistake
+from armcal_bench.servo.rigid_arm import RigidArm
 from scipy.spatial.transform import Rotation
+
+from tests.servo_records import ElasticArm
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "bench.yaml"
 LIMITS = np.deg2rad([100, 50, 80, 80, 80, 50])
@@ -66,14 +67,10 @@ def test_a_left_handed_frame_is_named(tools, seed: int, rotations: bool, count: 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("rotations", [True, False])
-def test_an_arm_in_any_frame_is_no_mistake_and_its_frame_is_found(tools, seed: int, rotations: bool) -> None:  # type: ignore[no-untyped-def]
+def test_an_arm_in_any_frame_is_no_mistake(tools, seed: int, rotations: bool) -> None:  # type: ignore[no-untyped-def]
     for count in (2, 3, 4, 8):
         _, expected, seen = measured(tools, seed, count, rotations)
         assert frame_mistake(expected, seen) is None
-    frame = frame_of(expected, seen)
-    assert frame is not None and np.linalg.det(frame.turn) == pytest.approx(1)
-    true = Rotation.random(random_state=seed).as_matrix()
-    assert Rotation.from_matrix(frame.turn.T @ true).magnitude() < np.deg2rad(8)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -104,13 +101,14 @@ def test_the_units_of_a_gain_are_those_of_the_table(gain: float, names: tuple[st
     assert found == names or (names == ("inch", "m") and found is not None)
 
 
-def drawn(nominal: NominalArm, seed: int) -> tuple[Array, Array, bool]:
+def drawn(elastic: ElasticArm, seed: int) -> tuple[Array, Array, bool]:
     """Poses of a plan, or of sweeps that may end with a joint that hardly moves the tip; of an arm not as drawn."""
     random = np.random.default_rng(seed)
-    stated, off = nominal.parameters, np.deg2rad(3)
-    values = {n: tuple(v + random.normal(0, off) for v in stated[n].nominal) for n in nominal.angles}
-    values |= {n: (nominal.compliance(n) * random.uniform(0, 3),) for n in nominal.compliances}
-    true = nominal.with_values(values, {j: random.normal(0, np.deg2rad(4)) for j in nominal.joints})
+    stated, off = elastic.experiment.parameters, np.deg2rad(3)
+    nominal = RigidArm(elastic.arm, stated)
+    values = {n: stated[n].nominal[0] + random.normal(0, off) for n in elastic.angles}
+    values |= {n: elastic.compliance(n) * random.uniform(0, 3) for n in elastic.compliances}
+    zeros = {j: random.normal(0, np.deg2rad(4)) for j in nominal.joints}
     gains, limits = random.uniform(0.8, 1.2, 6), dict(zip(nominal.joints, LIMITS, strict=True))
     base, swept = {j: random.uniform(-0.5, 0.5) * size for j, size in limits.items()}, seed % 3
     if swept:
@@ -119,7 +117,8 @@ def drawn(nominal: NominalArm, seed: int) -> tuple[Array, Array, bool]:
     else:
         poses = [{j: random.uniform(-size, size) for j, size in limits.items()} for _ in range(12)]
     stood = [{j: p[j] * g + random.normal(0, 0.009) for j, g in zip(p, gains, strict=True)} for p in poses]
-    seen, seat = true.tools(stood), random.normal(0, 0.03, 3)
+    stood = [{j: pose.get(j, 0.0) + zero for j, zero in zeros.items()} for pose in stood]
+    seen, seat = elastic.tools(stood, values), random.normal(0, 0.03, 3)
     seen[:, :3, 3] += seen[:, :3, :3] @ seat
     if random.random() < 0.4:
         seen[:, :3, :3] = np.nan
@@ -129,11 +128,10 @@ def drawn(nominal: NominalArm, seed: int) -> tuple[Array, Array, bool]:
 @pytest.mark.parametrize("draws", [12, pytest.param(400, marks=pytest.mark.slow)])
 def test_of_arms_not_as_drawn_one_in_a_hundred_at_most_is_said_to_be_measured_in_other_units(draws: int) -> None:
     """Springs up to 3 times the model's, axes off by 3 deg, zeros by 4, gains by 20 %, the target 50 mm elsewhere."""
-    experiment = Experiment.load(CONFIG)
-    nominal = NominalArm.of(Bench.of(experiment).arm, experiment.parameters, experiment.system.environment)
+    elastic = ElasticArm(Experiment.load(CONFIG))
     wrong, missed = [], []
     for seed in range(draws):
-        expected, seen, swept = drawn(nominal, seed)
+        expected, seen, swept = drawn(elastic, seed)
         for count in (3, 6, len(seen)):
             for gain in (1.0, 1000.0, 0.001) if count == len(seen) and seed % 3 < 2 else (1.0,):
                 scaled = seen[:count].copy()

@@ -17,7 +17,6 @@ from armcal_bench.acquisition.tracker_monitor import Waits
 from armcal_bench.servo.record import Record
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm, said_by
-from tests.servo_runs import put_rows
 
 FEW = ("bench.servo.joints=[c]", "bench.servo.step_deg=80")
 """A calibration of a few poses."""
@@ -62,22 +61,6 @@ class TestARefusedRunLeavesNothing:
         assert {round(math.degrees(line["told"]["b"])) for line in measured} == {-20}
         truth = yaml.safe_load(POST_SERVOS)["servos"]["c"]["pulses_us"]
         assert arm.pulses()["c"] == pytest.approx(truth, abs=3)
-
-    @pytest.mark.slow
-    def test_a_beginning_without_measurements_is_kept_aside_and_that_is_said(self, post: Bench) -> None:
-        """As an earlier version, or one that was killed, left it."""
-        arm = post.arm
-        arm.out.mkdir()
-        servo = {"board": "only", "channel": 2, "oscillator_hz": 25e6, "prescale": 121}
-        servo |= {"angles": [-1.7, 0.0, 1.7], "pulses": [6e-4, 1.5e-3, 2.4e-3]}
-        begun = {"kind": "begun", "servos": {"c": servo}, "base": {"a": 0.5, "b": 0.2, "c": -0.4}}
-        put_rows(arm.out, [begun])
-        again = arm.armcal("servo", "--out", arm.out, "--yes", "--keep", sets=FEW)
-        assert again.exit_code == 0, again.output
-        assert "kept as journal.sqlite.before-1" in again.output and "begins anew" in again.output
-        assert math.degrees(lines(arm.out)[0]["base"]["b"]) == pytest.approx(30)
-        (arm.out / "journal.sqlite.before-1").replace(arm.out / "journal.sqlite")
-        assert lines(arm.out)[0]["base"]["a"] == 0.5
 
     def test_measurements_of_another_base_pose_are_never_gone_on_with(self, post: Bench) -> None:
         """Guided ones neither: what is measured later is judged by the base pose that the record names."""

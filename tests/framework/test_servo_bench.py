@@ -117,7 +117,6 @@ def test_it_finds_what_the_servos_truly_are(calibrated, bench):
         spans = [knots[2]["pulse_us"] - knots[1]["pulse_us"], knots[1]["pulse_us"] - knots[0]["pulse_us"]]
         assert spans == pytest.approx([true[2] - true[1], true[1] - true[0]], abs=8.0)
         assert found["servos"][joint]["backlash_deg"] == pytest.approx(0.1, abs=0.05)
-    assert any("cannot be found" in sentence for sentence in found["findings"])
 
 
 @pytest.mark.slow
@@ -191,7 +190,6 @@ def test_guided_by_lines_of_a_pipe(calibrated, bench, tmp_path):
         ("bench:\n  servo: {joints: [q9]}\n", ("own.yaml:3", "bench.servo.joints", "q1, q2")),
         ("bench:\n  servo: {knots_deg: [10, 0]}\n", ("bench.servo", "do not rise")),
         ("bench:\n  servo: {step: 10}\n", ("bench.servo.step", "step_deg")),
-        ("bench:\n  servo: {measured_pulses: [{board: back, counts: 300, microseconds: 1480}]}\n", ("back", "front")),
         ("bench:\n  servo: {base: {q2: 80 deg}}\n", ("80.0 deg", "-50.0 to 50.0")),
         ("bench:\n  device: {servos: nowhere.yaml}\n", ("nowhere.yaml",)),
     ],

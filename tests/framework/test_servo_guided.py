@@ -10,19 +10,18 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal.errors import DataError, InputError
+from armcal.errors import InputError
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.keys import QUIT, WishKeys, WishLines, wishes_from
+from armcal_bench.keys import QUIT, OperatorInput, servo_input
 from armcal_bench.servo.outputs import improved
 from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import Conversation, evaluated, measure
+from armcal_bench.servo.session import evaluated, measure
+from armcal_bench.servo.setup import Conversation
 
 from tests.servo_fakes import config_in, setup_on
 
 SERVO = "bench:\n  servo: {joints: [q1, q3], approach: 4 deg}\n"
 TRUE_US = {"q1": (604.0, 1533.0, 2491.0), "q3": (650.0, 1560.0, 2420.0)}
-STATED = {"board": "front", "channel": 0, "oscillator_hz": 25e6, "prescale": 121}
-STATED |= {"angles": [-1.0, 1.0], "pulses": [1e-3, 2e-3]}
 KNOTS = (-100.0, 0.0, 100.0)
 
 
@@ -68,7 +67,7 @@ def test_somebody_who_knows_the_angles_finds_the_tables(tmp_path, monkeypatch):
     outcome = evaluated(setup, tmp_path / "out")
     assert outcome.zero == "measured"
     for joint, pulses in TRUE_US.items():
-        found = outcome.fit.servos[joint]
+        found = outcome.servos[joint]
         assert 1e6 * np.array(found.pulses) == pytest.approx(pulses, abs=3.7)  # half a count, and on to the end
     changed = improved(setup.file, outcome)
     assert changed.servos["q2"].pulses == setup.file.servos["q2"].pulses
@@ -111,24 +110,7 @@ def test_stopped_after_any_angle_and_given_again_it_finds_the_same(tmp_path, mon
         assert observed(folder) == whole[:cut]
         measure(setup, folder, talk(Person(device)), "guided")
         assert observed(folder) == whole
-        assert (
-            evaluated(setup, folder).fit.servos["q1"].pulses
-            == evaluated(setup, tmp_path / "whole").fit.servos["q1"].pulses
-        )
-
-
-def test_an_entry_that_is_no_observation_is_refused_with_its_place(tmp_path):
-    with Record(tmp_path) as record:
-        record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
-        record.append("what", {})
-    with pytest.raises(DataError, match=r"journal.sqlite: entry 2: .*delete from entry where sequence = 2"):
-        Record(tmp_path)
-
-
-def test_observations_of_an_earlier_version_are_named(tmp_path):
-    (tmp_path / "observations.jsonl").write_text('{"kind": "begun"}\n')
-    with pytest.raises(InputError, match=r"observations of an earlier version of armcal \(observations.jsonl\)"):
-        Record(tmp_path)
+        assert evaluated(setup, folder).servos["q1"].pulses == evaluated(setup, tmp_path / "whole").servos["q1"].pulses
 
 
 def test_a_record_of_another_oscillator_is_refused(tmp_path, monkeypatch):
@@ -179,8 +161,7 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
     master, slave = os.openpty()
     try:
         before = termios.tcgetattr(slave)
-        with pytest.raises(RuntimeError), wishes_from(slave) as wishes:
-            assert isinstance(wishes, WishKeys)
+        with pytest.raises(RuntimeError), servo_input(slave) as wishes:
             assert not termios.tcgetattr(slave)[3] & (termios.ICANON | termios.ECHO)
             os.write(master, b"\x1b[A\x1b[B\x1b[5~x\x1b[6~\rsbq")
             assert [wishes.next(1.0) for _ in range(8)] == ["+1", "-1", "+10", "-10", "ok", "skip", "back", "quit"]
@@ -191,7 +172,7 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
             assert wishes.next(5.0) == "+1"  # a key that comes in pieces
             raise RuntimeError
         assert termios.tcgetattr(slave) == before
-        with wishes_from(slave) as wishes:
+        with servo_input(slave) as wishes:
             os.close(master)
             master = -1
             assert wishes.next(1.0) == "quit"  # nobody is there any more
@@ -204,10 +185,10 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
 def test_lines_from_a_pipe_and_its_end():
     reader, writer = os.pipe()
     try:
-        lines = WishLines(reader)
+        lines = OperatorInput(reader, at_end=QUIT)
         assert lines.next(0.01) is None
         os.write(writer, b"+10\n\n  OK \nsk")
-        assert [lines.next(1.0), lines.next(1.0), lines.next(0.01)] == ["+10", "ok", None]
+        assert [lines.next(1.0) for _ in range(3)] == ["+10", "", "  OK "] and lines.next(0.01) is None
         os.write(writer, b"ip")
         os.close(writer)
         assert [lines.next(1.0), lines.next(1.0), lines.next(1.0)] == ["skip", "quit", "quit"]
@@ -236,4 +217,4 @@ def test_back_asks_again_and_the_later_answer_counts(tmp_path, monkeypatch):
     measure(setup, tmp_path / "out", quiet, "guided")
     (first, again) = observed(tmp_path / "out")
     assert first[:3] == again[:3] and again[3] - first[3] == 4
-    assert evaluated(setup, tmp_path / "out").sweeps["q1"].counts == [again[3]]
+    assert evaluated(setup, tmp_path / "out").servos["q1"].used == 1

@@ -298,17 +298,14 @@ def test_a_still_base_may_be_out_of_sight_once_it_was_seen() -> None:
 def test_the_drift_of_a_stand_and_its_deviations() -> None:
     """Of 400 stands of one drift the estimates spread as their stated deviations."""
     random, times = np.random.default_rng(4), np.arange(0, 1, 1 / 60)
-    rates, turns, found, sds = np.array([1e-3, -2e-3, 0.0]), np.array([0.0, 5e-3, -3e-3]), [], []
+    rates, found, sds = np.array([1e-3, -2e-3, 0.0]), [], []
     for _ in range(400):
         poses = np.tile(np.eye(4), (len(times), 1, 1))
         poses[:, :3, 3] = np.outer(times, rates) + random.normal(0, 5e-5, (len(times), 3))
-        noise = Rotation.from_rotvec(random.normal(0, 3e-4, (len(times), 3)))
-        turned = Rotation.from_rotvec(np.outer(times, turns)) * noise
-        poses[:, :3, :3] = turned.as_matrix()
         stand = drift_of(times, poses)
         assert stand is not None
         found.append(stand.rates)
         sds.append(stand.sds)
-    assert np.mean(found, axis=0) == pytest.approx([*rates, *turns], abs=1e-4)
+    assert np.mean(found, axis=0) == pytest.approx(rates, abs=1e-4)
     assert np.std(found, axis=0) == pytest.approx(np.sqrt(np.mean(np.square(sds), axis=0)), rel=0.2)
     assert drift_of(times[:1], poses[:1]) is None

@@ -2,7 +2,6 @@
 
 import heapq
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
@@ -14,7 +13,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, measured_angles, standing_at, state_of
 
 from armcal_bench.acquisition.heat import HeatModel, ThermalState
-from armcal_bench.acquisition.run_log import ENERGISED, RunLog
+from armcal_bench.acquisition.run_log import ENERGISED, Log
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.acquisition.tracker_monitor import MayMove, unguarded
 
@@ -156,70 +155,14 @@ _PLAY_RAD = np.deg2rad(3.0)  # More than servos have play
 _TAKEN_UP_RAD = np.deg2rad(1.5)  # A turn by less may end within the play, on neither side of it
 
 
-class Motion(ABC):
-    """An arm that is commanded step by step: between two steps the board hears that the host lives, and servos warm.
+class Drive:
+    """An arm that is commanded step by step along paths: between two steps the board hears that the host lives.
 
     Attributes:
         device, clock: of the bench.
         joints: that are moved.
         period: between two steps (s).
         thermal_state: of the servos, by the model.
-    """
-
-    def __init__(
-        self, device: JointDevice, clock: Clock, joints: tuple[str, ...], period: float, thermal_state: ThermalState
-    ) -> None:
-        self.device, self.clock, self.joints, self.period = device, clock, joints, period
-        self.thermal_state = thermal_state
-        self._alive = self._heated = clock.now()
-
-    @property
-    @abstractmethod
-    def angles(self) -> Mapping[str, float]:
-        """The commanded joint angles (rad)."""
-
-    def stand(self, seconds: float, may_move: MayMove) -> None:
-        """Hold for some time.
-
-        Raises:
-            StopRequested: by ``may_move``.
-            DeviceError: the device failed.
-        """
-        until = self.clock.now() + seconds
-        while (left := until - self.clock.now()) > 0:
-            self._pause(min(left, _ALIVE_EVERY_S), may_move)
-
-    def tick(self, may_move: MayMove) -> bool:
-        """One period of holding; whether the arm may move. See ``stand``."""
-        return self._pause(self.period, may_move)
-
-    def _pause(self, seconds: float, may_move: MayMove) -> bool:
-        self.clock.sleep(seconds)
-        self.keep_alive()
-        now = self.clock.now()
-        if now - self._heated >= _HEATED_EVERY_S:
-            self._heated = now
-            self.thermal_state.pass_to_now(self.angles)
-        return may_move()
-
-    def keep_alive(self) -> None:
-        """Often enough for the device, not more often; while the arm moves too, for a device that failed shows then."""
-        now = self.clock.now()
-        if now - self._alive >= _ALIVE_EVERY_S:
-            self._alive = now
-            self.device.keep_alive()
-
-    def release(self) -> None:
-        """End all pulses, one by one, the tip's first."""
-        for joint in reversed(self.joints):
-            self.device.release(joint)
-            self.clock.sleep(_RELEASED_EVERY_S)
-
-
-class Drive(Motion):
-    """The arm as it is driven along paths.
-
-    Attributes:
         settings: rate, period and the park pose, among others.
         at: the commanded joint angles (joints, rad).
         approach: the sign of each joint's last motion; 0 before its first, and where that took up no play (joints).
@@ -232,10 +175,11 @@ class Drive(Motion):
         planner: PathPlanner,
         settings: AcquisitionSettings,
         heat: HeatModel,
-        log: RunLog,
+        log: Log,
     ) -> None:
-        thermal_state = ThermalState(heat, device.joint_names, settings.park, clock)
-        super().__init__(device, clock, device.joint_names, settings.period, thermal_state)
+        self.device, self.clock, self.joints, self.period = device, clock, device.joint_names, settings.period
+        self.thermal_state = ThermalState(heat, device.joint_names, clock)
+        self._alive = self._heated = clock.now()
         self._planner, self.settings, self._log = planner, settings, log
         self._rate = float(np.deg2rad(settings.rate_deg_per_s))
         self._noted = clock.now()
@@ -345,10 +289,44 @@ class Drive(Motion):
                 self.go((here, there, here), may_move)
                 return
 
+    def stand(self, seconds: float, may_move: MayMove) -> None:
+        """Hold for some time.
+
+        Raises:
+            StopRequested: by ``may_move``.
+            DeviceError: the device failed.
+        """
+        until = self.clock.now() + seconds
+        while (left := until - self.clock.now()) > 0:
+            self._pause(min(left, _ALIVE_EVERY_S), may_move)
+
+    def tick(self, may_move: MayMove) -> bool:
+        """One period of holding; whether the arm may move. See ``stand``."""
+        return self._pause(self.period, may_move)
+
     def _pause(self, seconds: float, may_move: MayMove) -> bool:
         if self.clock.now() - self._noted >= _NOTED_EVERY_S:
             self.note()
-        return super()._pause(seconds, may_move)
+        self.clock.sleep(seconds)
+        self.keep_alive()
+        now = self.clock.now()
+        if now - self._heated >= _HEATED_EVERY_S:
+            self._heated = now
+            self.thermal_state.pass_to_now(self.angles)
+        return may_move()
+
+    def keep_alive(self) -> None:
+        """Often enough for the device, not more often; while the arm moves too, for a device that failed shows then."""
+        now = self.clock.now()
+        if now - self._alive >= _ALIVE_EVERY_S:
+            self._alive = now
+            self.device.keep_alive()
+
+    def release(self) -> None:
+        """End all pulses, one by one, the tip's first."""
+        for joint in reversed(self.joints):
+            self.device.release(joint)
+            self.clock.sleep(_RELEASED_EVERY_S)
 
     @property
     def trouble(self) -> str:
@@ -358,6 +336,10 @@ class Drive(Motion):
     def path_home(self, start: Array) -> JointPath | None:
         """From a pose (joints, rad) to where the arm parks."""
         return self._planner.find(start, self.park)
+
+    def hold(self) -> None:
+        """The arm is to stay where it is when the host falls silent."""
+        self.device.guard([self.angles], self._rate, self.settings.silence)
 
     def note(self) -> None:
         """Write down where it is and how hot."""

@@ -15,7 +15,6 @@ from armcal.devices.clock import Clock
 from armcal_bench.acquisition.settings import ServoHeatSettings
 
 NEVER = float("inf")
-_ENOUGH = 0.8  # Of the budget: one more point warms a servo by less than the rest of it
 COOLED_TO = 0.5  # Of the budget: a rest goes on to here, so that the servos do not rest before every pose
 _SAME_HEAT = 1e-4
 _TIMES_OVER = 20.0
@@ -121,17 +120,15 @@ class ThermalState:
     Args:
         model: of the servos.
         joints: in the arm's order.
-        rest: where the servos rest (rad by joint; others at zero).
         clock: the bench's.
 
     Attributes:
         warmth: of winding and case (joints x 2).
     """
 
-    def __init__(self, model: HeatModel, joints: Sequence[str], rest: Mapping[str, float], clock: Clock) -> None:
+    def __init__(self, model: HeatModel, joints: Sequence[str], clock: Clock) -> None:
         self.model, self._joints, self._clock = model, joints, clock
         self.warmth, self._since = self.model.cold, clock.now()
-        self._at_rest = self.model.torques(self._pose(rest))
 
     def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
         """From another run's warmth (winding and case, by joint), after which joints stood at angles (rad) for so long.
@@ -160,20 +157,6 @@ class ThermalState:
         """
         if self.model.over(self.warmth):
             raise ThermalLimit(f"the servo of {self._hottest[0]} has come to its budget")
-
-    @property
-    def must_rest(self) -> bool:
-        return bool(np.any(self.model.heat(self.warmth) > _ENOUGH * self.model.budget))
-
-    @property
-    def rest_s(self) -> float:
-        return self.model.cooled_in(self.warmth, self._at_rest, COOLED_TO * self.model.budget)
-
-    @property
-    def too_heavy_at_rest(self) -> str:
-        """The joint that would not cool where the servos rest; empty if all do."""
-        hot = self.model.too_hot_for_ever(self._at_rest, COOLED_TO)
-        return "" if hot is None else self._joints[hot]
 
     def hotter_than(self, warmth: Array, angles: Mapping[str, float]) -> bool:
         """Whether a servo is hotter than in a thermal state (joints x 2), and still cools at these angles (rad)."""

@@ -1,7 +1,6 @@
 """A plan made ready to be driven: every pose checked before anything moves."""
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +17,8 @@ from armcal.run.plan import approach_channels
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
 from armcal_bench.acquisition.drive import PathPlanner
+from armcal_bench.acquisition.evidence import Arrival
 from armcal_bench.acquisition.heat import HeatModel, holding_torques
-from armcal_bench.acquisition.sag import Arrival, SagJudge
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
 from armcal_bench.bench import Bench
@@ -34,17 +33,13 @@ class Prepared:
     """All that a run needs besides its devices."""
 
     bench: Bench
+    settings: AcquisitionSettings
     device: JointDevice
     plan: Dataset  # joint commands and the plan's ids, in its order
     scheduler: Scheduler  # over the angles that the device can set nearest to them; with the planner and the heat model
     arrival: Arrival  # whether the arm stands where it was commanded to
-    sag: SagJudge  # names a joint that gives way
     judge: HazardJudge  # of what is dangerous in the first motions and the last
     warnings: tuple[str, ...]  # of limits beyond the arm model's own
-
-    @property
-    def settings(self) -> AcquisitionSettings:
-        return self.bench.settings.acquisition
 
 
 def prepare(experiment: Experiment, plan: Path) -> Prepared:
@@ -62,33 +57,48 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     limits = run_limits(experiment, settings, arm)
     poses = _settable_poses(device, commands.stacked(space.channels).T, limits, plan, commands)
     park = _settable_park(experiment, settings, device, limits)
+    prepared = of_poses(bench, settings, device, commands, poses, _approaches(commands, space), limits, park)
+    _check_clear(prepared.scheduler.planner, poses, plan, commands)
+    check_park(experiment, prepared.scheduler.planner, prepared.scheduler.model, park, device.joint_names)
+    planned = experiment.settings.plan.limits if experiment.settings.plan else {}
+    return replace(prepared, warnings=stated_beyond(experiment, {**planned, **settings.limits}))
+
+
+def of_poses(
+    bench: Bench,
+    settings: AcquisitionSettings,
+    device: JointDevice,
+    plan: Dataset,
+    poses: Array,
+    approaches: Array,
+    limits: Array,
+    park: Array,
+) -> Prepared:
+    """A run through poses (N x joints, rad) that were found to be allowed, as the device can set them.
+
+    Args:
+        bench, settings: of the run.
+        device: it moves all joints of the arm.
+        plan: with the ids of the poses.
+        poses, approaches: see ``Scheduler``.
+        limits: of the joints (joints x 2, rad).
+        park: where the arm rests (joints, rad).
+    """
+    experiment, arm = bench.experiment, bench.arm
     settable = np.array(
         [
             [_last_settable(device, joint, float(inside), float(end)) for end in ends]
             for joint, inside, ends in zip(device.joint_names, park, limits, strict=True)
         ]
     )
-    check = clearance_of(experiment, arm)
-    planner = PathPlanner(check, settable, np.vstack([park, poses]), settings.path_step, settings.seed)
-    _check_clear(planner, poses, plan, commands)
+    check, known = clearance_of(experiment, arm), np.vstack([park, poses])
+    planner = PathPlanner(check, settable, known, settings.path_step, settings.seed)
     heat = heat_of(experiment, settings, arm)
-    _check_park(experiment, planner, heat, park, device.joint_names)
-    scheduler = Scheduler(
-        poses=poses,
-        ids=commands.ids,
-        approaches=_approaches(commands, space),
-        park=park,
-        planner=planner,
-        model=heat,
-        rate=float(np.deg2rad(settings.rate_deg_per_s)),
-        capture=settings.settle.wait + settings.settle.window + 0.5,
-    )
+    rate, capture = float(np.deg2rad(settings.rate_deg_per_s)), settings.settle.wait + settings.settle.window + 0.5
+    scheduler = Scheduler(poses, plan.ids, approaches, park, planner, heat, rate, capture)
     judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
-    sag = SagJudge(device.joint_names, partial(nominal_tools, arm), heat.torques)
-    planned = experiment.settings.plan.limits if experiment.settings.plan else {}
-    warnings = stated_beyond(experiment, {**planned, **settings.limits})
-    return Prepared(bench, device, commands, scheduler, arrival, sag, judge, warnings)
+    return Prepared(bench, settings, device, plan, scheduler, arrival, judge, ())
 
 
 def _check_measures(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice) -> None:
@@ -146,7 +156,7 @@ def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device
     return _nearest_settable(device, park)
 
 
-def _check_park(
+def check_park(
     experiment: Experiment, planner: PathPlanner, heat: HeatModel, park: Array, joints: tuple[str, ...]
 ) -> None:
     """Refuse a park pose (joints, rad) that is too near to something, or in which a servo would not cool."""

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -18,6 +18,7 @@ from armcal.io.plain_files import write_whole
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
+from typing_extensions import override
 
 STARTED, ENERGISED, GOING, HERE = "started", "energised", "going", "here"
 MEASURED, LEFT_OUT, NOTICE, ENDED = "measured", "left_out", "told", "ended"  # Kinds of entries
@@ -80,7 +81,34 @@ def progress_of(entries: Iterable[Entry]) -> Progress:
     return progress
 
 
-class RunLog:
+class Log(Protocol):
+    """Where a run writes down what it does; see ``RunLog``."""
+
+    progress: Progress
+
+    def record(self, kind: str, content: Mapping[str, Any]) -> None:
+        """An entry that outlasts a power loss."""
+
+    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
+        """The commanded angles (rad)."""
+
+
+class NoLog(Log):
+    """For motions that nobody goes on with."""
+
+    def __init__(self) -> None:
+        self.progress = Progress()
+
+    @override
+    def record(self, kind: str, content: Mapping[str, Any]) -> None:
+        self.progress = self.progress.after(kind, content)
+
+    @override
+    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
+        pass
+
+
+class RunLog(Log):
     """An open journal.
 
     Attributes:
@@ -95,6 +123,7 @@ class RunLog:
         self.identity = DeviceIdentity(started[-1]["name"], started[0]["device"]) if started else None
         self._failed = False
 
+    @override
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
         """Write an entry that outlasts a power loss.
 
@@ -105,6 +134,7 @@ class RunLog:
             self._journal.record(kind, dict(content))
         self.progress = self.progress.after(kind, content)
 
+    @override
     def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
         """Write the commanded angles (rad); a power loss may take the last of these. See ``record``."""
         with self._once():

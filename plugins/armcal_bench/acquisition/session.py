@@ -5,26 +5,37 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.config_text import plain
 from armcal.calibration.calibration_file import identity_of
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceIdentity, DeviceUnwellError, open_device, state_of
+from armcal.devices.device import (
+    DeviceError,
+    DeviceIdentity,
+    DeviceRefusedError,
+    DeviceUnwellError,
+    JointDevice,
+    open_device,
+    state_of,
+)
 from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
+from armcal.plugins import blaming
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.drive import Drive
+from armcal_bench.acquisition.evidence import Drift, Evidence, FrameRefused, JointGivesWay
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.preparation import Prepared
-from armcal_bench.acquisition.recovery import DeviceLost, Recovery
 from armcal_bench.acquisition.run_log import (
     OURS,
     EndedHow,
+    Log,
     Progress,
     RunLog,
     in_order,
@@ -32,7 +43,6 @@ from armcal_bench.acquisition.run_log import (
     write_measured,
     write_outputs,
 )
-from armcal_bench.acquisition.sag import Arrival, Sag, SagJudge
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.acquisition.tracker_monitor import (
     MotionGate,
@@ -45,92 +55,102 @@ from armcal_bench.acquisition.tracker_monitor import (
 from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
-from armcal_bench.settling import Settled, Stand, pose_of
-
-
-class FrameRefused(StopRequested):
-    """The tracker's units or handedness are not those that are expected."""
-
-
-class JointGivesWay(StopRequested):
-    """A joint moves while the arm should stand, pose after pose."""
-
-
-class Evidence:
-    """Everything that was seen, of poses that count as measured and of others.
-
-    Args:
-        poses: commanded, by index (N x joints, rad).
-        arrival: compares poses with the model's.
-        sag: names a joint that gives way.
-
-    Attributes:
-        doubted: what was recorded of poses that do not count as measured, by their index.
-    """
-
-    def __init__(self, poses: Array, arrival: Arrival, sag: SagJudge) -> None:
-        self.doubted: dict[int, Mapping[str, Any]] = {}
-        self.arrival, self._poses, self._sag = arrival, poses, sag
-        self._stands: list[tuple[int, Stand]] = []
-        self._failed = 0
-
-    def stood(self, pose: int, stand: Stand | None) -> None:
-        """How the target moved while the arm should stand in a pose; None where it was hardly seen."""
-        if stand is not None:
-            self._stands.append((pose, stand))
-
-    def succeeded(self, pose: int) -> None:
-        self._failed = 0
-        self.doubted.pop(pose, None)
-
-    def failed(self, measured: Mapping[int, Array]) -> None:
-        """The arm did not come to stand in a pose, or stood elsewhere.
-
-        Args:
-            measured: ``base_T_target`` (4 x 4, m) of measured poses, by their index.
-
-        Raises:
-            JointGivesWay: that happened several times in a row, and a joint is the reason.
-        """
-        self._failed += 1
-        sag = self.gives_way(measured, self._failed) if self._failed >= self.arrival.settings.in_a_row else None
-        if sag is not None and sag.joints:
-            raise JointGivesWay(f"{sag.sentence}. {sag.mend}".rstrip("."))
-
-    def gives_way(self, measured: Mapping[int, Array], last: int = 0) -> Sag | None:
-        """A joint that gives way, by the last so many stands, or all of them. See ``failed``."""
-        stands = self._stands[-last:]
-        if not stands:
-            return None
-        seen = np.array(list(measured.values())).reshape(-1, 4, 4)
-        angles = self._poses[[pose for pose, _ in stands]]
-        return self._sag.sag_of(angles, [stand for _, stand in stands], (self._poses[list(measured)], seen))
-
-    def check_frame(self, measured: Mapping[int, Array]) -> None:
-        """Refuse other units or another frame than expected, by everything that was seen. See ``failed``.
-
-        Raises:
-            FrameRefused: they are others.
-        """
-        glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
-        doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
-        if (mistake := self.arrival.mistake({**glimpsed, **measured, **doubted})) is not None:
-            kept = "The poses that were measured are kept as they came"
-            raise FrameRefused(f"{mistake.sentence}. {mistake.mend} {kept}")
-
+from armcal_bench.settling import Settled, pose_of
 
 T = TypeVar("T")
+WhenStopped = Literal["park", "hold"]
 _TRIES = 2
 _READINGS = 10  # Of servos that know where they stand: their mean is finer than a count
+_AGAIN_EVERY_S = 0.25
+_MOST_IN_A_ROW = 10
+_LAST_TRIES_S = 2.0  # Somebody who wants the end gets it as it should be, if the device is back within this time
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
+
+
+class DeviceLost(Exception):  # noqa: N818 - an ending, not an error of a caller
+    """The device does not come back; the message says how long it was tried.
+
+    Attributes:
+        fault: the last one; None where somebody asked for the end meanwhile.
+    """
+
+    def __init__(self, why: str, fault: DeviceError | None) -> None:
+        super().__init__(why)
+        self.fault = fault
+
+
+class Recovery:
+    """Of a device that was opened with an identity; tried for ``longest_s`` at most.
+
+    ``notice`` takes what happens, ``trouble`` or ``back``, and a sentence.
+    """
+
+    def __init__(
+        self,
+        device: JointDevice,
+        identity: DeviceIdentity,
+        gate: MotionGate,
+        longest_s: float,
+        notice: Callable[[str, str], None] = lambda what, sentence: None,
+    ) -> None:
+        self._device, self._identity, self._gate, self._longest = device, identity, gate, longest_s
+        self._notice = notice
+        self._in_a_row, self._since = 0, gate.clock.now()
+
+    def persist(self, action: Callable[[], T], restore: Callable[[], None]) -> T:
+        """Do it; when the device fails, hold until it is open and restored, and do it again.
+
+        Raises:
+            DeviceLost: it does not come back, or fails again at once, time after time.
+            DeviceUnwellError: it works, and the arm is to be parked.
+        """
+        while True:
+            try:
+                result: T = blaming(action)()
+                return result
+            except DeviceUnwellError:
+                raise
+            except DeviceError as fault:
+                self._notice("trouble", str(fault))
+                self._reopen(fault, restore)
+                self._notice("back", "the device is back")
+
+    def _reopen(self, fault: DeviceError, restore: Callable[[], None]) -> None:
+        clock, waits = self._gate.clock, self._gate.waits
+        began = clock.now()
+        self._in_a_row, self._since = (self._in_a_row if began - self._since <= self._longest else 0) + 1, began
+        if self._in_a_row > _MOST_IN_A_ROW:
+            raise DeviceLost(f"the device failed {self._in_a_row} times in a row ({fault})", fault)
+        while (left := began + self._longest - clock.now()) > 0:
+            why = f"the arm holds, the device is looked for: {fault.message.rstrip('.')}"
+            waits.goes_on("device", why, left, clock.now())
+            if self._gate.asked_to_end() and clock.now() >= began + _LAST_TRIES_S:
+                raise DeviceLost(f"it was asked to stop while the device was lost ({fault})", None)
+            clock.sleep(_AGAIN_EVERY_S)
+            try:
+                reopened, begun = open_device(self._device, clock), self._identity
+                if (reopened.digest, reopened.name) != (begun.digest, begun.name):
+                    text = f"found {reopened.name}, expected {begun.name}, with which the run began."
+                    raise DeviceRefusedError(text, hint="Connect the board that the run began with.")
+                restore()
+                waits.over("device", clock.now())
+                return
+            except DeviceRefusedError as refused:
+                # Another program or another board may hold the port for a while.
+                fault = DeviceError(str(refused))
+            except DeviceError as again:
+                fault = again
+        waits.given_up("device")
+        raise DeviceLost(f"the device did not come back in {self._longest:.0f} s ({fault})", fault)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended, and a sentence why."""
+    """How a run ended, a sentence why, and what the arm does then where it does not park."""
 
     how: EndedHow
     sentence: str
+    arm: str = "the arm holds"
 
 
 class AcquisitionRun:
@@ -142,8 +162,9 @@ class AcquisitionRun:
         scheduler: decides what comes next.
         gate: asked between two steps of the arm.
         log: the journal, in which every step is written as it is made.
-        evidence: of what is wrong with the tracker's frame, or with a joint.
+        evidence: of what is wrong with the tracker's frame, or with the arm.
         on_progress: called after each pose.
+        when_stopped: what the arm does when somebody asks for the end.
     """
 
     def __init__(
@@ -152,10 +173,12 @@ class AcquisitionRun:
         identity: DeviceIdentity,
         scheduler: Scheduler,
         gate: MotionGate,
-        log: RunLog,
+        log: Log,
         evidence: Evidence,
         on_progress: Callable[[Progress], None],
+        when_stopped: WhenStopped = "park",
     ) -> None:
+        self._when_stopped = when_stopped
         self._drive, self._scheduler, self._gate = drive, scheduler, gate
         self._recovery = Recovery(drive.device, identity, gate, drive.settings.lost.park, self._notice)
         self._log, self._evidence, self._on_progress = log, evidence, on_progress
@@ -182,9 +205,11 @@ class AcquisitionRun:
             except JointGivesWay as fault:
                 return self._park_and_end("failed", str(fault))
             except (StopRequested, DeviceUnwellError) as request:
+                if self._when_stopped == "hold" and self._gate.asked_to_end():
+                    return self._hold_and_end(str(request))
                 return self._park_and_end("parked", str(request))
             except DeviceLost as loss:
-                return self._end(Ending("held", f"{loss}; {_AS_IT_IS}"))
+                return self._end(Ending("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS))
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
             self._park_after(fault)
@@ -247,7 +272,7 @@ class AcquisitionRun:
         if isinstance(settled, str):
             self._try_later(step.pose, settled)
             self._check_frame()
-            self._evidence.failed(self.known)
+            self._evidence.failed(settled)
         else:
             self._accept(step.pose, settled)
 
@@ -283,6 +308,7 @@ class AcquisitionRun:
             **self._here(),
             **settled.record,
             "deviation": settled.deviations[:3].tolist(),
+            "turn_deviation": [float(d) if np.isfinite(d) else None for d in settled.deviations[3:]],
             "frames": settled.frames,
             "rejected": settled.rejected,
             "temperature": self._settings.temperature,
@@ -295,7 +321,7 @@ class AcquisitionRun:
         if doubt:
             self._astray += 1
             self._try_later(pose, doubt)
-            self._evidence.failed(self.known)
+            self._evidence.failed(doubt)
             if self._astray >= self._settings.arrival.in_a_row:
                 raise StopRequested(f"{doubt}, {self._astray} times in a row; look at servos, gears and bodies")
             return
@@ -342,6 +368,14 @@ class AcquisitionRun:
         self._left.remove(pose)
         self._on_progress(self._log.progress)
 
+    def _hold_and_end(self, why: str) -> Ending:
+        """Stay, should the host fall silent too."""
+        try:
+            self._drive.hold()
+        except DeviceError:
+            return self._end(Ending("held", f"{why}, while the board was lost", _AS_IT_IS))
+        return self._end(Ending("held", why))
+
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
         """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
@@ -350,7 +384,7 @@ class AcquisitionRun:
             if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
                 self._persist(self._drive.release, lambda: None)
         except (DeviceLost, DeviceUnwellError) as loss:
-            return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}"))
+            return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}", _AS_IT_IS))
         return self._end(Ending(how, why))
 
     def _park_after(self, fault: Exception) -> None:
@@ -396,6 +430,7 @@ class RunOptions:
     on_progress: Callable[[Progress], None]  # called after each pose
     unchecked: bool = False  # drive servos too of which nobody has checked that they move their joint
     waits: Waits = field(default_factory=Waits)  # says what is waited for
+    when_stopped: WhenStopped = "park"  # what the arm does when somebody asks for the end
 
 
 @dataclass(frozen=True)
@@ -417,23 +452,23 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
     experiment = prepared.bench.experiment
     measured_by(experiment)
     header = _header(prepared, plan)
-    opened = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
-    with prepared.bench.clock() as clock, opened as journal:
+    kept = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
+    with prepared.bench.clock() as clock, kept as journal:
         log = RunLog(journal)
         progress, identity = log.progress, log.identity
         _check_frame(prepared, progress, options.folder)
         is_done = {*progress.measured, *progress.left_out} >= set(prepared.scheduler.ids)
-        sag: Sag | None = None
+        drift: Drift | None = None
         if identity is not None and is_done and progress.ended in ("done", "parked", "failed"):
             how, why = progress.at_the_end(len(prepared.scheduler.ids))  # nothing needs to be there
             ending = Ending(how, "it was done before" if how == "done" else why)
         else:
             try:
-                with _opened(prepared, options, clock, log) as (gate, identity):
+                with opened(prepared, options, clock, partial(_check_board, log)) as (gate, identity):
                     log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-                    evidence = Evidence(prepared.scheduler.poses, prepared.arrival, prepared.sag)
-                    run = _prepared_run(prepared, options, log, gate, identity, evidence)
-                    ending, progress, sag = run.run(), log.progress, evidence.gives_way(run.known)
+                    evidence = Evidence(prepared.arrival)
+                    run = ready_run(prepared, options, log, gate, identity, evidence)
+                    ending, progress, drift = run.run(), log.progress, evidence.drift()
             except (Exception, SystemExit):
                 if identity is not None:
                     with suppress(Exception):  # the journal holds it, whatever else is broken
@@ -441,7 +476,7 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
                 raise
         summary = {
             **_summary(prepared, ending, progress),
-            "gives_way": None if sag is None else sag.content,
+            "gives_way": None if drift is None else drift.content,
             "board": identity.name,
             "digests": _digests(identity, header),
         }
@@ -490,11 +525,19 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
     return {"plan": digest, "config": identity_of({**data, "bench": bench}), "began": time.time()}
 
 
+def _check_board(log: RunLog, identity: DeviceIdentity) -> None:
+    if log.identity is not None and log.identity.digest != identity.digest:
+        raise InputError(
+            f"the run was begun with another board, or another calibration of it, than {identity.name}.",
+            hint="Connect the board that the run began with, with the servo file that it began with.",
+        )
+
+
 @contextmanager
-def _opened(
-    prepared: Prepared, options: RunOptions, clock: Clock, log: RunLog
+def opened(
+    prepared: Prepared, options: RunOptions, clock: Clock, check: Callable[[DeviceIdentity], None]
 ) -> Iterator[tuple[MotionGate, DeviceIdentity]]:
-    """With device and tracker, both alive; nothing moves."""
+    """With device and tracker, both alive; nothing moves. ``check`` may refuse a device."""
     device, monitor = prepared.device, TrackerMonitor(prepared.bench, clock)
 
     def pause() -> None:
@@ -503,11 +546,7 @@ def _opened(
 
     with closing(monitor, device):
         identity = open_device(device, clock)
-        if log.identity is not None and log.identity.digest != identity.digest:
-            raise InputError(
-                f"the run was begun with another board, or another calibration of it, than {identity.name}.",
-                hint="Connect the board that the run began with, with the servo file that it began with.",
-            )
+        check(identity)
         wiring = wiring_of(prepared.bench.experiment.source, device)
         if wiring is not None and not options.unchecked:
             wiring.check(device.joint_names, identity.adapter)
@@ -517,10 +556,10 @@ def _opened(
         yield MotionGate(monitor, clock, prepared.settings.lost, options.asked_to_end, options.waits), identity
 
 
-def _prepared_run(
+def ready_run(
     prepared: Prepared,
     options: RunOptions,
-    log: RunLog,
+    log: Log,
     gate: MotionGate,
     identity: DeviceIdentity,
     evidence: Evidence,
@@ -535,7 +574,8 @@ def _prepared_run(
     drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
     if progress.thermal_state:  # the warmth that an earlier part of the run has left
-        drive.thermal_state.go_on(progress.thermal_state, progress.angles, clock.wall() - progress.at)
+        standing = {**progress.angles, **state_of(device).angles}
+        drive.thermal_state.go_on(progress.thermal_state, standing, clock.wall() - progress.at)
     angles = state_of(device).angles
     releases, measured = settings.at_end == "release", drive.measured()
     start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
@@ -544,4 +584,4 @@ def _prepared_run(
     before = options.asked_to_end()
     if not options.may_energise(start) or (options.asked_to_end() and not before):
         raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-    return AcquisitionRun(drive, identity, scheduler, gate, log, evidence, options.on_progress)
+    return AcquisitionRun(drive, identity, scheduler, gate, log, evidence, options.on_progress, options.when_stopped)

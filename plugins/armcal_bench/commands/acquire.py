@@ -126,8 +126,8 @@ def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) ->
     if ending.how == "refused":
         console.line("Mend that, and begin anew with another --out.")
         return
-    if (sag := summary["gives_way"]) and "should stand" not in ending.sentence:
-        console.warn(sag["what"])
+    if (drift := summary["gives_way"]) and "should stand" not in ending.sentence:
+        console.warn(drift["what"])
     if ending.how in ("held", "parked") or len(summary["left_out"]) + summary["measured"] < summary["poses"]:
         console.line("Go on with --resume.")
         return

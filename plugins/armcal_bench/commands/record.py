@@ -23,7 +23,7 @@ from armcal.version import JSON_SCHEMA
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
-from armcal_bench.keys import Keys, LineKeys, NoKeys, TerminalKeys, single_keys
+from armcal_bench.keys import RECORDING_KEYS, OperatorInput, single_keys
 from armcal_bench.recording.recorder import KEYS, LOOK, Message
 from armcal_bench.recording.recording_log import DATASET, IMAGES
 from armcal_bench.recording.session import record
@@ -107,7 +107,7 @@ def _with_source(source: ConfigSource, part: str, usual: str, option: str, named
 
 
 @contextmanager
-def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
+def _keys(bench: Bench, capture: str) -> Iterator[tuple[OperatorInput, bool]]:
     """What a person types, and whether that is a terminal; never what the joint readings come from.
 
     Raises:
@@ -115,7 +115,7 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
     """
     is_taken = (bench.settings.joints or {}).get("source") == STANDARD_INPUT
     if not is_taken and not sys.stdin.isatty():
-        yield LineKeys(sys.stdin.fileno()), False
+        yield OperatorInput(sys.stdin.fileno()), False
         return
     descriptor = None
     if not is_taken:
@@ -129,10 +129,13 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[Keys, bool]]:
                 "standard input gives the joint readings and there is no terminal, so no key can start a capture.",
                 hint="Give --capture still, or let the readings come from udp:PORT or a file.",
             )
-        yield NoKeys(), False
+        yield OperatorInput(None), False
         return
     try:
         with single_keys(descriptor):
-            yield TerminalKeys(descriptor, lambda text: click.echo(text, err=True, nl=False)), True
+            yield (
+                OperatorInput(descriptor, RECORDING_KEYS, echo=lambda text: click.echo(text, err=True, nl=False)),
+                True,
+            )
     finally:
         os.close(descriptor)

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -19,15 +18,13 @@ from armcal.io.journal import JOURNAL
 from armcal.io.signals import Signals
 from armcal.report.document import Document, Section, Table
 
-from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.commands.acquire import driven
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.joint_check import check_joints
-from armcal_bench.keys import wishes_from
+from armcal_bench.keys import servo_input
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
-from armcal_bench.servo.session import Conversation, adapter_of, evaluated, measure, park, tried
-from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.session import adapter_of, evaluated, measure, park, tried
+from armcal_bench.servo.setup import Conversation, Setup
 from armcal_bench.servo.trial import Verdict, swapped
 
 
@@ -56,20 +53,22 @@ def servo(
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     experiment = load(console, config, overrides)
-    if check and not guided and servo_file_of(experiment.source) is None:
-        _check_joints(console, config, overrides, may_energise)
-        return
-    setup = Setup.of(experiment)
+    is_bus = check and not guided and servo_file_of(experiment.source) is None
+    setup = None if is_bus else Setup.of(experiment)
     with Signals() as signals, console.progress() as show:
         talk = Conversation(
             asked_to_stop=lambda: signals.finish,
             may_energise=warned(console, may_energise),
             report=lambda joint, done, planned: show(f"measuring {joint}", done / max(planned, 1)),
             say=partial(say, err=console.json),
-            wishes=lambda: wishes_from(0),
+            wishes=lambda: servo_input(0),
             waits=waits(console),
         )
-        if check:
+        if setup is None:
+            with _stoppable(console):
+                result = check_joints(experiment, talk)
+            _show_verdicts(console, result.verdicts, [], result.far_zeros, result.notes)
+        elif check:
             with _stoppable(console):
                 verdicts = tried(setup, talk, "somebody" if guided else "tracker")
             _show_verdicts(console, verdicts, swapped(verdicts))
@@ -80,7 +79,7 @@ def servo(
                 with _stoppable(console):
                     measure(setup, out, talk, "guided" if guided else "automatic")
             _evaluate(console, setup, out, keep)
-        if parks or release:
+        if setup is not None and (parks or release):
             with _stoppable(console):
                 park(setup, talk, "release" if release else "hold")
 
@@ -97,7 +96,7 @@ def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
         before.carry_over(after)
     names = {"servo_file": str(setup.path), "before": None if earlier is None else str(earlier)}
     console.show(_document(content, setup.joints), **names)
-    console.detail(f"{len(outcome.task.observations)} angles, in {JOURNAL}.")
+    console.detail(f"{sum(s.used + len(s.outliers) for s in outcome.servos.values())} angles, in {JOURNAL}.")
     if earlier is not None:
         console.line(f"{setup.path}: written; the one before is {earlier.name}")
     left = [joint for joint in setup.joints if not content["servos"].get(joint, {"written": False})["written"]]
@@ -131,17 +130,6 @@ def _show_verdicts(
         sys.exit(EXIT_FAULT)
 
 
-def _check_joints(console: Console, config: Path, overrides: tuple[str, ...], may_energise: Question) -> None:
-    """The check of servos that know where they stand; what is measured for it is not kept."""
-    with TemporaryDirectory() as folder:
-
-        def drive(prepared: Prepared, plan: Path, out: Path) -> None:
-            driven(console, prepared, plan, (out, "anew"), may_energise, unchecked=True)
-
-        check = check_joints(lambda more: load(console, config, (*overrides, *more)), Path(folder), drive)
-    _show_verdicts(console, check.verdicts, [], check.far_zeros, check.notes)
-
-
 @contextmanager
 def _stoppable(console: Console) -> Iterator[None]:
     try:
@@ -168,12 +156,7 @@ def _document(content: Mapping[str, Any], joints: Sequence[str]) -> Document:
             rows.append(("" if i else joint, *pulses, *changes, "" if i else backlash))
     columns = ("servo", "deg", "us", "sd", "before", "change, us", "change, deg", "backlash, deg")
     table = Table("Pulses at angles, and what changed", columns, rows)
-    oscillators = [
-        f"{name}: oscillator {board['oscillator_hz'] / 1e6:.4f} +- {board['oscillator_sd_hz'] / 1e6:.4f} MHz"
-        for name, board in content["boards"].items()
-        if board["oscillator_sd_hz"] is not None
-    ]
     written = sum(servo["written"] for servo in content["servos"].values())
     headline = f"{written} of {len(joints)} servo tables were found."
     sections = [Section("Pulses", parts=[table], level="always")]
-    return Document("Servos", headline, sections, summary=[*oscillators, *content["findings"]], data=content)
+    return Document("Servos", headline, sections, summary=content["findings"], data=content)

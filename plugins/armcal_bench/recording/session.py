@@ -1,6 +1,5 @@
 """A recording from opening the stream to its end."""
 
-from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from armcal.plugins import refuse
 
 from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.journal_folder import Start, opened_journal
-from armcal_bench.keys import END, Keys
+from armcal_bench.keys import END, OperatorInput
 from armcal_bench.recording.agreement import contacts_of
 from armcal_bench.recording.labels import Labels
 from armcal_bench.recording.recorder import Capture, Message, Recorder
@@ -27,7 +26,7 @@ def record(
     bench: Bench,
     to: tuple[Path, Start],
     capture: Capture,
-    keys: Keys,
+    keys: OperatorInput,
     asked_to_end: Callable[[], bool],
     show: Callable[[Message], None],
 ) -> Message:
@@ -84,22 +83,20 @@ def _capture(bench: Bench, chosen: Capture, stream: JointStream, camera: LiveCam
 
 
 def _messages(
-    recorder: Recorder, stream: JointStream, keys: Keys, asked_to_end: Callable[[], bool], clock: Clock
+    recorder: Recorder, stream: JointStream, keys: OperatorInput, asked_to_end: Callable[[], bool], clock: Clock
 ) -> Iterator[Message]:
     """All that happens, as it does, until somebody ends it or the stream ends."""
     yield from recorder.begin()
-    typed: deque[str] = deque()
     while True:
         has_ended = stream.ended  # before its last samples are taken
         yield from recorder.take(samples_of(stream))
-        typed.extend(keys.commands())
-        if typed:  # one a round, so that each finds fresh readings
-            command = typed.popleft()
+        command = keys.next()  # one a round, so that each finds fresh readings
+        if command is not None:
             if command.strip() == END:
                 break
             yield from recorder.command(command)
         is_over = has_ended or (keys.ended and recorder.capture == "keys")
-        if asked_to_end() or (is_over and not typed):
+        if asked_to_end() or (is_over and command is None):
             break
         clock.sleep(_PERIOD_S)
     if isinstance(stream, RestStream) and stream.gives_rests:

@@ -24,11 +24,9 @@ from armcal.config.servo_file import (
 from armcal.errors import ConfigError
 from armcal.io.plain_files import write_whole, writing
 
-from armcal_bench.servo.outcome import Outcome
-from armcal_bench.servo.problem import FittedServo
 from armcal_bench.servo.record import next_name
+from armcal_bench.servo.tables import FittedServo, Outcome
 
-_SENSIBLE_HZ = (23e6, 27e6)
 _FAR_CHANGE = 0.1
 _SAG_WORTH = math.radians(0.1)
 
@@ -42,27 +40,12 @@ def is_usable(servo: FittedServo) -> bool:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """A sentence each, of servos, zeros, boards and springs."""
+    """A sentence each, of servos, zeros and springs."""
     texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
-    for servo in outcome.fit.servos.values():
+    for servo in outcome.servos.values():
         texts += list(_of_servo(servo, outcome))
     if outcome.zero == "kept":
         texts.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
-    for board, clock in outcome.fit.clocks.items():
-        if not any(servo.known.board == board for servo in outcome.fit.servos.values()):
-            continue
-        if board not in outcome.fit.oscillator_sds:
-            texts.append(
-                f"{board}: the oscillator cannot be found from tables that are not known, so it is left at "
-                f"{clock.oscillator_hz / 1e6:.3f} MHz and the tables count by it. Angles are right all the same. To "
-                "know the oscillator, measure a pulse (bench.servo.measured_pulses) or trust a table "
-                "(bench.servo.trusted)."
-            )
-        if not _SENSIBLE_HZ[0] <= clock.oscillator_hz <= _SENSIBLE_HZ[1]:
-            texts.append(
-                f"{board}: an oscillator of {clock.oscillator_hz / 1e6:.2f} MHz is outside "
-                f"{_SENSIBLE_HZ[0] / 1e6:.0f} to {_SENSIBLE_HZ[1] / 1e6:.0f} MHz: check what it was measured by."
-            )
     return texts + _of_springs(outcome)
 
 
@@ -106,8 +89,8 @@ def _of_servo(servo: FittedServo, outcome: Outcome) -> Iterator[str]:
             "stated one; the deviations are enlarged by that."
         )
     for outlier in servo.outliers:
-        angle = math.degrees(outlier.angle)
-        yield f"{joint}: the angle at {outlier.counts} counts ({angle:.1f} deg) lies far off and was set aside."
+        counts, angle = outlier
+        yield f"{joint}: the angle at {counts} counts ({math.degrees(angle):.1f} deg) lies far off and was set aside."
 
 
 def _gain_change(servo: FittedServo) -> float:
@@ -117,8 +100,7 @@ def _gain_change(servo: FittedServo) -> float:
 
 
 def _of_springs(outcome: Outcome) -> list[str]:
-    tracked = [joint for joint, sweeps in outcome.sweeps.items() if sweeps.by is not None]
-    if not tracked:
+    if all(servo.by == "somebody" for servo in outcome.servos.values()):
         return []
     if not any(outcome.sag_span.values()):
         return [
@@ -128,7 +110,7 @@ def _of_springs(outcome: Outcome) -> list[str]:
     worst = max(outcome.sag_span, key=lambda joint: outcome.sag_span[joint])
     if outcome.sag_span[worst] < _SAG_WORTH:
         return []
-    how = "found with the tables" if outcome.compliances or outcome.fit.undetermined else "the model's"
+    how = "found with the tables" if outcome.compliances or outcome.undetermined else "the model's"
     return [
         f"springs: over a sweep they turn the tool by up to {math.degrees(outcome.sag_span[worst]):.1f} deg ({worst}); "
         f"that is taken out by compliances that are {how}."
@@ -220,23 +202,17 @@ Part = TypeVar("Part", BoardSettings, ServoSettings)
 
 
 def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
-    """The servo file with the fitted numbers; servos whose board has another oscillator now keep their counts.
+    """The servo file with the fitted numbers.
 
     Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
     part is kept whose pulses its servo bears.
     """
     boards = {name: board if board.id else _changed(board, id=adapter) for name, board in file.boards.items()}
-    for name in outcome.fit.oscillator_sds:
-        hz = outcome.fit.clocks[name].oscillator_hz
-        boards[name] = _changed(boards[name], oscillator_hz=hz)
     servos: dict[str, ServoSettings] = {}
     for joint, servo in file.servos.items():
-        fitted_servo = outcome.fit.servos.get(joint)
+        fitted_servo = outcome.servos.get(joint)
         table = None if fitted_servo is None else _fitted_table(fitted_servo, servo, outcome, boards[servo.board])
-        if table is None:
-            longer = file.boards[servo.board].oscillator_hz / boards[servo.board].oscillator_hz
-            same = PulseTable(servo.angles, tuple(pulse * longer for pulse in servo.pulses))
-            table = _borne_part(same, servo, boards[servo.board]) or servo.table
+        table = table or servo.table
         servos[joint] = _changed(servo, angles=table.angles, pulses=table.pulses)
     return ServoFile(boards, servos)
 
@@ -245,12 +221,10 @@ def _fitted_table(
     fitted_servo: FittedServo, servo: ServoSettings, outcome: Outcome, board: BoardSettings
 ) -> PulseTable | None:
     """The table that is written for a servo that was measured; None where none can be, and its own is kept."""
-    if fitted_servo.known.trusted_sd is not None:
-        return servo.table
     if not is_usable(fitted_servo):
         return None
     # Counts stay what they are: the file's board may have another oscillator than that of the record.
-    same = outcome.fit.clocks[servo.board].oscillator_hz / board.oscillator_hz
+    same = outcome.clocks[servo.board].oscillator_hz / board.oscillator_hz
     return _borne_part(
         PulseTable(fitted_servo.angles, tuple(round(p * same, 9) for p in fitted_servo.pulses)), servo, board
     )
@@ -315,13 +289,9 @@ def _text_of(path: Path, before: str, file: ServoFile) -> str:
 
 def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
     return {
-        "servos": {joint: _servo(servo, outcome, changed) for joint, servo in outcome.fit.servos.items()},
-        "boards": {
-            name: {"oscillator_hz": clock.oscillator_hz, "oscillator_sd_hz": outcome.fit.oscillator_sds.get(name)}
-            for name, clock in outcome.fit.clocks.items()
-        },
+        "servos": {joint: _servo(servo, outcome, changed) for joint, servo in outcome.servos.items()},
         "compliances_rad_per_Nm": {name: {"value": v, "sd": sd} for name, (v, sd) in outcome.compliances.items()},
-        "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.fit.undetermined)},
+        "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.undetermined)},
         "findings": [*findings(outcome), *_narrowed(outcome, changed)],
     }
 
@@ -334,7 +304,7 @@ def _is_written(fitted_servo: FittedServo, outcome: Outcome, changed: ServoFile)
 def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
     """Of tables that reach less far than they were stated to, or than they were to be given for."""
     sentences = []
-    for joint, fitted_servo in outcome.fit.servos.items():
+    for joint, fitted_servo in outcome.servos.items():
         servo, stated = changed.servos[joint], fitted_servo.known.table.angles
         meant = min(stated[0], fitted_servo.angles[0]), max(stated[-1], fitted_servo.angles[-1])
         if not _is_written(fitted_servo, outcome, changed):
@@ -365,7 +335,6 @@ def write_results(folder: Path, summary: Mapping[str, Any]) -> None:
 
 
 def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
-    sweeps = outcome.sweeps[servo.known.joint]
     stated = servo.known.pulses_at(np.array(servo.angles))
     slopes = np.gradient(np.array(servo.pulses), np.array(servo.angles))  # by a knot's neighbours (s/rad)
     slopes[np.abs(slopes) <= 1e-9] = math.nan
@@ -389,7 +358,6 @@ def _servo(servo: FittedServo, outcome: Outcome, changed: ServoFile) -> dict[str
         "scatter_deg": math.degrees(servo.scatter),
         "observations": servo.used,
         "set_aside": len(servo.outliers),
-        "seen_by": sweeps.by or "somebody",
-        "axis": None if sweeps.turning is None else sweeps.turning.axis.tolist(),
+        "seen_by": servo.by,
         "written": _is_written(servo, outcome, changed),
     }

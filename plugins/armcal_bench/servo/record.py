@@ -1,115 +1,36 @@
-"""All that was observed, each entry of the journal on disk before anything else happens.
+"""All that was observed, each entry of the journal on disk before anything else happens."""
 
-Entries are checked when they are read: one that was damaged must not become a table.
-"""
-
-import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
-from armcal.arm.servo import COUNTS, PulseClock, PulseTable
+from armcal.arm.servo import PulseClock, PulseTable
 from armcal.devices.device import DeviceIdentity
 from armcal.errors import DataError, InputError, Location
-from armcal.io.journal import JOURNAL, Entry, Journal, KeptJournal, has_journal
+from armcal.io.journal import JOURNAL, Journal, KeptJournal, has_journal
 from armcal.io.plain_files import writing
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from typing_extensions import override
 
-from armcal_bench.servo.problem import KnownBoard, KnownServo
+from armcal_bench.acquisition.run_log import LEFT_OUT as PASSED
+from armcal_bench.acquisition.run_log import MEASURED, Log, Progress
 from armcal_bench.servo.setup import Setup
+from armcal_bench.servo.tables import KnownServo
 
-_LINES_BEFORE = "observations.jsonl"  # what versions before had in the journal's place
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of entries
 
-_ROTATION_OFF = 1e-6
-
-
-Counts = Annotated[int, Field(gt=0, lt=COUNTS)]
-Row = tuple[float, float, float]
 _SAME = 1e-6
 
 
-class _Line(BaseModel):
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
-
-
-class _StatedServo(_Line):
-    board: str
-    channel: int
-    oscillator_hz: Annotated[float, Field(gt=0)]
-    prescale: int
-    angles: tuple[float, ...]
-    pulses: tuple[float, ...]
-
-    @model_validator(mode="after")
-    def _usable(self) -> Self:
-        PulseTable(self.angles, self.pulses)
-        PulseClock(self.oscillator_hz, self.prescale)
-        return self
-
-
-class _Begun(_Line):
-    kind: Literal["begun"]
-    servos: Annotated[dict[str, _StatedServo], Field(min_length=1)]
-    base: dict[str, float]
-
-
-class _Place(_Line):
-    joint: str
-    came: Literal[-1, 1]
-    at: float
-    warmth: dict[str, tuple[float, float]] = {}
-
-
-class _Pose(_Place):
-    kind: Literal["pose"]
-    counts: Counts
-    told: dict[str, float]
-    position: Row
-    rotation: tuple[Row, Row, Row] | None
-    deviations: Annotated[tuple[Annotated[float, Field(ge=0)] | None, ...], Field(min_length=6, max_length=6)]
-
-    @model_validator(mode="after")
-    def _is_turned(self) -> Self:
-        matrix = np.eye(3) if self.rotation is None else np.array(self.rotation)
-        if np.linalg.det(matrix) < 0 or np.abs(matrix @ matrix.T - np.eye(3)).max() > _ROTATION_OFF:
-            raise ValueError("no rotation")
-        return self
-
-
-class _Angle(_Place):
-    kind: Literal["angle"]
-    counts: Counts
-    target: float
-    angle: float
-    sd: Annotated[float, Field(gt=0)]
-
-
-class _LeftOut(_Place):
-    kind: Literal["left_out"]
-    counts: int | None = None
-    target: float | None = None
-
-    @model_validator(mode="after")
-    def _is_about_a_point(self) -> Self:
-        if self.counts is None and self.target is None:
-            raise ValueError("neither counts nor a target")
-        return self
-
-
-_LINES: TypeAdapter[_Line] = TypeAdapter(Annotated[_Begun | _Pose | _Angle | _LeftOut, Field(discriminator="kind")])
-
-
 class Record:
-    """The observations in a folder's journal; what is there is read and checked at once, and written to when needed.
+    """The observations in a folder's journal; what is there is read at once, and written to when needed.
 
     Raises:
-        DataError: an entry is not one of ours, or damaged.
-        InputError: it is of an earlier version, or cannot be read.
+        DataError: it is no record of a servo calibration.
+        InputError: it cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -118,12 +39,10 @@ class Record:
         self._entries: list[Mapping[str, Any]] = []
         if has_journal(folder):
             with KeptJournal(folder) as journal:
-                for number, entry in enumerate(journal.entries(), start=1):
-                    self._entries.append(_checked(self.path, number, entry))
-        elif (folder / _LINES_BEFORE).exists():
-            text = f"it holds the observations of an earlier version of armcal ({_LINES_BEFORE})."
-            hint = "Go on, or evaluate them, with that version; or give another --out."
-            raise InputError(text, where=Location(str(folder)), hint=hint)
+                self._entries = [{"kind": entry.kind, **entry.content} for entry in journal.entries()]
+            if self._entries and self._entries[0]["kind"] != BEGUN:
+                text = "found a first entry that does not say by which tables it was begun."
+                raise DataError(text, where=Location(str(self.path)), hint="Give another --out.")
 
     def __enter__(self) -> Self:
         return self
@@ -141,10 +60,6 @@ class Record:
     def begun(self) -> Mapping[str, Any] | None:
         """The first entry; None where there is none."""
         return self._entries[0] if self._entries else None
-
-    @property
-    def is_measured(self) -> bool:
-        return len(self._entries) > 1
 
     def set_aside(self) -> Path:
         """Keep the journal under another name, which is given, and be empty.
@@ -176,22 +91,42 @@ class Record:
         self._journal = None
 
 
-def _checked(path: Path, number: int, entry: Entry) -> Mapping[str, Any]:
-    damage, content = "", {"kind": entry.kind, **(entry.content if isinstance(entry.content, dict) else {})}
-    try:
-        is_beginning = isinstance(_LINES.validate_json(json.dumps(content)), _Begun)
-    except ValidationError:
-        damage = "an entry that is no observation, or a damaged one"
-    else:
-        if number == 1 and not is_beginning:
-            damage = "a first entry that does not say by which tables it was begun"
-        elif number > 1 and is_beginning:
-            damage = "a second beginning"
-    if damage:
-        remove = f'sqlite3 {path} "delete from entry where sequence = {entry.sequence}"'
-        hint = "Give another --out." if number == 1 else f"Give another --out, or remove it: {remove}"
-        raise DataError(f"entry {entry.sequence}: found {damage}.", where=Location(str(path)), hint=hint)
-    return content
+class SweepLog(Log):
+    """Of a run whose poses are those of sweeps: what was observed goes to the record, and no more.
+
+    A pose is called by its joint, counts and side: ``q3 307 +``. What an earlier run left out is tried once more.
+    """
+
+    def __init__(self, record: Record) -> None:
+        self._record, entries = record, record.entries
+        measured = {pose_name(e["joint"], e["counts"], e["came"]): e for e in entries if e["kind"] == POSE}
+        warm = next((entry for entry in reversed(entries) if entry.get("warmth")), None)
+        self.progress = Progress(measured)
+        if warm is not None:
+            self.progress = Progress(measured, thermal_state=warm["warmth"], at=float(warm["at"]))
+
+    @override
+    def record(self, kind: str, content: Mapping[str, Any]) -> None:
+        self.progress = self.progress.after(kind, content)
+        if kind not in (MEASURED, PASSED):
+            return
+        joint, counts, side = str(content["pose"]).rsplit(" ", 2)
+        line: dict[str, Any] = {"joint": joint, "counts": int(counts), "came": 1 if side == "+" else -1}
+        if kind == PASSED:
+            self._record.append(LEFT_OUT, {**line, "at": self.progress.at, "why": content["why"]})
+            return
+        deviations = [float(d) if np.isfinite(d) else None for d in content["deviation"]] + content["turn_deviation"]
+        line |= {"at": content["at"], "warmth": content["warmth"], "told": content["standing"]}
+        line |= {key: content[key] for key in ("position", "rotation", "frames")}
+        self._record.append(POSE, {**line, "deviations": deviations})
+
+    @override
+    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
+        pass
+
+
+def pose_name(joint: str, counts: int, came: int) -> str:
+    return f"{joint} {counts} {'+' if came > 0 else '-'}"
 
 
 def next_name(path: Path) -> Path:
@@ -202,35 +137,26 @@ def next_name(path: Path) -> Path:
     return kept
 
 
-def begin(setup: Setup, record: Record, device: DeviceIdentity | None, say: Callable[[str], None]) -> None:
+def begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
     """The first entry of a record: by which tables and in which base pose it is measured.
 
-    It is written when nothing is left that could refuse the run. One that stands there without a measurement after it
-    is of a run that measured nothing, and must not be taken for this run's.
+    It is written when nothing is left that could refuse the run.
     """
-    if record.is_measured:
-        return
-    servos = {joint: _as_stated(setup, joint) for joint in setup.base}
-    board = {} if device is None else {"device": device.name, "adapter": device.adapter}
-    content = {"servos": servos, **board, "base": dict(setup.base)}
-    if (begun := record.begun) is not None:
-        if {**begun, **content} == begun:
-            return
-        kept = record.set_aside()
-        say(
-            f"{record.path}: it was begun with another base pose, servo file or board, and holds no measurement; it is "
-            f"kept as {kept.name}, and this run begins anew."
-        )
-    record.append(BEGUN, content)
+    if record.begun is None:
+        servos = {joint: _as_stated(setup, joint) for joint in setup.base}
+        content = {"servos": servos, "device": device.name, "adapter": device.adapter, "base": dict(setup.base)}
+        record.append(BEGUN, content)
 
 
 def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
-    """A record that holds measurements goes on only with the board, the wiring and the base pose that it began with.
+    """A record goes on only with the board, the wiring and the base pose that it began with.
 
     Raises:
         InputError: it would be another one.
     """
-    begun = record.entries[0]
+    begun = record.begun
+    if begun is None:
+        return
     where = Location(str(record.path))
     adapter = str(begun.get("adapter", ""))
     if adapter and device.adapter and adapter != device.adapter:
@@ -268,9 +194,9 @@ def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:
     }
 
 
-def stated_by(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[KnownServo], dict[str, KnownBoard]]:
-    """Servos and boards as they were when the record was begun."""
-    servos, boards = [], setup.boards()
+def stated_by(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[KnownServo], dict[str, PulseClock]]:
+    """Servos and boards' clocks as they were when the record was begun."""
+    servos, clocks = [], setup.clocks
     for joint in joints:
         stated = begun["servos"].get(joint)
         if stated is None:
@@ -278,6 +204,5 @@ def stated_by(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[K
             continue
         table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
         servos.append(replace(setup.known(joint), table=table))
-        clock = PulseClock(stated["oscillator_hz"], stated["prescale"])
-        boards[stated["board"]] = KnownBoard(clock, boards[stated["board"]].measured)
-    return servos, boards
+        clocks[stated["board"]] = PulseClock(stated["oscillator_hz"], stated["prescale"])
+    return servos, clocks

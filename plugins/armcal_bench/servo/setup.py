@@ -1,56 +1,54 @@
 """What a servo calibration is about: the servos of a file, the arm that they move, and where it may go."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from itertools import pairwise, permutations, takewhile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field, replace
+from itertools import pairwise, takewhile
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, Self, TypeVar
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, Compliance, Duration, InputPath, Length, Settings, UnitOf
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
+from armcal.devices.clock import Clock
 from armcal.devices.device import (
-    DeviceError,
     DeviceIdentity,
     DeviceRefusedError,
+    DeviceState,
     JointDevice,
     PulseDevice,
     open_device,
     state_of,
 )
 from armcal.devices.wiring import servo_file_of
-from armcal.errors import ConfigError, InputError
+from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
+from typing_extensions import override
 
-from armcal_bench.acquisition.drive import Motion, PathPlanner
-from armcal_bench.acquisition.heat import HeatModel, ThermalState
-from armcal_bench.acquisition.preparation import clearance_of, heat_of, run_limits
-from armcal_bench.acquisition.recovery import Recovery
-from armcal_bench.acquisition.tracker_monitor import MotionGate
+from armcal_bench.acquisition.drive import PathPlanner
+from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.preparation import Prepared, clearance_of, heat_of, of_poses, run_limits
+from armcal_bench.acquisition.run_log import Progress
+from armcal_bench.acquisition.session import RunOptions
+from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings
+from armcal_bench.acquisition.tracker_monitor import Waits
 from armcal_bench.bench import SECTION, Bench
-from armcal_bench.hazards import HazardJudge
-from armcal_bench.servo.nominal import NominalArm
-from armcal_bench.servo.problem import KnownBoard, KnownServo, MeasuredPulse
+from armcal_bench.hazards import FirstMotion, HazardJudge
+from armcal_bench.keys import OperatorInput
+from armcal_bench.servo.rigid_arm import RigidArm
+from armcal_bench.servo.tables import KnownServo
 
 PositiveAngle = Annotated[Angle, Field(gt=0)]
 PositiveDuration = Annotated[Duration, Field(gt=0)]
 Angles = Annotated[tuple[float, ...], UnitOf("angle")]
 PulseRange = Annotated[tuple[float, float], UnitOf("time")]
-
-
-class MeasuredPulseSettings(Settings):
-    """A pulse measured at a pin of a board, by an oscilloscope for example."""
-
-    board: str
-    counts: Annotated[int, Field(ge=1, le=4095)]
-    microseconds: Annotated[float, Field(gt=0)]
-    sd_microseconds: Annotated[float, Field(gt=0)] = 0.1
 
 
 class ServoCalibrationSettings(Settings):
@@ -67,8 +65,6 @@ class ServoCalibrationSettings(Settings):
         zero: ``kept``: each servo's pulse at zero stays; ``model``: angles are absolute, by the model and the tracker.
         sag: what springs give is taken from the model's compliances, fitted with the tables, or not reckoned with.
         sag_sd: how far compliances may well be from the model's, where they are fitted.
-        measured_pulses: pulses measured at boards' pins: they determine the oscillators.
-        trusted: joints whose stated tables are believed, by how well: they determine the oscillators too.
         silence: after this silence of the host a board that can brings the arm back to the base pose.
     """
 
@@ -88,8 +84,6 @@ class ServoCalibrationSettings(Settings):
     rotation_sd: PositiveAngle = math.radians(0.03)  # of a settled rotation about an axis
     least_radius: Length = 0.03  # of a circle that shows an angle, where a tracker sees positions only
     guided_sd: PositiveAngle = math.radians(0.5)  # how well a joint is put at an angle by eye
-    measured_pulses: tuple[MeasuredPulseSettings, ...] = ()
-    trusted: dict[str, PositiveDuration] = Field(default_factory=dict)
     check: PositiveAngle = math.radians(10)  # how far ``--check`` moves a joint
     silence: PositiveDuration = 1.0
 
@@ -105,8 +99,34 @@ class ServoCalibrationSettings(Settings):
         return self
 
 
+ReportProgress = Callable[[str, int, int], None]  # Takes the joint, and how many of its points are done and planned
+
+
+@dataclass(frozen=True)
+class Conversation:
+    """How a calibration speaks with whom it is for.
+
+    Attributes:
+        may_energise: whether the arm may be moved; called once before anything moves, with what is
+            about to move and what is dangerous in it.
+    """
+
+    asked_to_stop: Callable[[], bool]  # whether somebody wants it to hold and end
+    may_energise: Callable[[FirstMotion], bool]
+    report: ReportProgress  # takes how far a tracked calibration is
+    say: Callable[[str], None]  # takes a line, of a guided one
+    wishes: Callable[[], AbstractContextManager[OperatorInput]]  # what somebody types, while it is asked for
+    waits: Waits = field(default_factory=Waits)  # says what is waited for
+
+    def options(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> RunOptions:
+        """Those of a measuring run, of which a calibration is one."""
+        stop, may = self.asked_to_stop, self.may_energise
+        return RunOptions(Path(), "anew", stop, may, on_progress, unchecked=True, when_stopped="hold", waits=self.waits)
+
+
 AT = (SECTION, "servo")
 _LOOK_STEP = math.radians(2.0)
+ANYWHERE = ArrivalSettings.si(astray=100.0, astray_turned=2 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -120,7 +140,7 @@ class Setup:
     joints: tuple[str, ...]  # those to calibrate
     base: Mapping[str, float]  # where every servo's joint stands while others are measured (rad)
     ranges: Mapping[str, tuple[float, float]]  # over which each joint may be moved from there (rad)
-    nominal: NominalArm  # the arm by its model
+    nominal: RigidArm  # the arm by its model
     heat: HeatModel  # of the servos
     planner: PathPlanner  # of straight ways on which nothing comes too near, if that is stated
     judge: HazardJudge  # of what is dangerous in the first motions
@@ -153,7 +173,7 @@ class Setup:
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
         limits = dict(zip(arm.commanded, run_limits(experiment, acquisition, arm).tolist(), strict=True))
-        nominal = NominalArm.of(arm, experiment.parameters, experiment.system.environment)
+        nominal = RigidArm(arm, experiment.parameters)
         heat = heat_of(experiment, bench.settings.acquisition, arm)
         ends = np.array(list(limits.values()))
         planner = PathPlanner(clearance_of(experiment, arm), ends, np.zeros((0, len(limits))), _LOOK_STEP)
@@ -164,7 +184,7 @@ class Setup:
 
     def known(self, joint: str) -> KnownServo:
         servo = self.file.servos[joint]
-        return KnownServo(joint, servo.board, servo.table, self.settings.trusted.get(joint), self.knots_of(joint))
+        return KnownServo(joint, servo.board, servo.table, self.knots_of(joint))
 
     def table_of(self, joint: str) -> tuple[PulseTable, PulseClock]:
         servo = self.file.servos[joint]
@@ -187,12 +207,9 @@ class Setup:
         borne, allowed = self.file.servos[joint].pulse_range, self.settings.pulses
         return max(borne[0], allowed[0]), min(borne[1], allowed[1])
 
-    def boards(self) -> dict[str, KnownBoard]:
-        measured: dict[str, tuple[MeasuredPulse, ...]] = {}
-        for pulse in self.settings.measured_pulses:
-            known = MeasuredPulse(pulse.counts, 1e-6 * pulse.microseconds, 1e-6 * pulse.sd_microseconds)
-            measured[pulse.board] = (*measured.get(pulse.board, ()), known)
-        return {name: KnownBoard(board.clock, measured.get(name, ())) for name, board in self.file.boards.items()}
+    @property
+    def clocks(self) -> dict[str, PulseClock]:
+        return {name: board.clock for name, board in self.file.boards.items()}
 
     def _clear_ranges(
         self, experiment: Experiment, limits: Mapping[str, tuple[float, float]]
@@ -234,9 +251,25 @@ class Setup:
         allowed = takewhile(lambda angle: self.planner.allowed(self._pose({joint: float(angle)})), way)
         return float(list(allowed)[-1])
 
-    def clear_between(self, start: Mapping[str, float], goal: Mapping[str, float]) -> bool:
-        """Whether nothing comes too near on the straight way between two poses (rad by joint)."""
-        return self.planner.clear(self._pose(start), self._pose(goal))
+    @property
+    def acquisition(self) -> AcquisitionSettings:
+        """Of the runs: an arm whose tables may be wrong is anywhere; it rests in the base pose."""
+        own = self.settings
+        changes: dict[str, Any] = {"rate_deg_per_s": own.rate_deg_per_s, "period": own.period, "silence": own.silence}
+        changes |= {"park": dict(self.base), "at_end": "hold", "angles": "commanded", "arrival": ANYWHERE}
+        return self.bench.settings.acquisition.model_copy(update=changes)
+
+    def run(
+        self, device: "PulsedJoints", poses: Mapping[str, tuple[Mapping[str, float], Mapping[str, int]]]
+    ) -> Prepared:
+        """A run through poses by id: where joints are that are not in the base pose (rad), and from where they come."""
+        joints = device.joint_names
+        angles = np.array([[{**self.base, **pose}[joint] for joint in joints] for pose, _ in poses.values()])
+        sides = np.array([[float(side.get(joint, 0)) for joint in joints] for _, side in poses.values()])
+        ends = np.array([self.ranges[joint] for joint in joints])
+        standing = device.standing(self.base)
+        park = np.array([standing[joint] for joint in joints])
+        return of_poses(self.bench, self.acquisition, device, Dataset(tuple(poses), {}), angles, sides, ends, park)
 
     def _pose(self, other: Mapping[str, float]) -> Array:
         return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])
@@ -245,7 +278,7 @@ class Setup:
 def _check_names(
     experiment: Experiment, settings: ServoCalibrationSettings, file: ServoFile, moved: tuple[str, ...]
 ) -> None:
-    for key in ("joints", "base", "ranges", "trusted"):
+    for key in ("joints", "base", "ranges"):
         if fault := unknown_joint(getattr(settings, key), moved):
             where = experiment.source.where((*AT, key))
             raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
@@ -253,191 +286,127 @@ def _check_names(
         text = "the servo file has no servo of a joint of this arm."
         hint = f"Name them as the joints: {', '.join(file.servos)} are not in the model."
         raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
-    for index, measured in enumerate(settings.measured_pulses):
-        if measured.board not in file.boards:
-            text = f"no board is called {str(measured.board)!r}."
-            hint = f"Boards are {', '.join(file.boards)}."
-            raise ConfigError(text, where=experiment.source.where((*AT, "measured_pulses", index)), hint=hint)
-
-
-T = TypeVar("T")
-_BETWEEN_JOINTS_S = 0.5
-_LONGEST_LOSS_S = 30.0
 
 
 class ServoDevice(JointDevice, PulseDevice, Protocol):
     """What a servo calibration needs: joints moved by pulses."""
 
 
-class Mover(Motion):
-    """Moves servos; ``counts`` holds each one's as they were set, and ``came`` the sign of its last step.
+class PulsedJoints(JointDevice):
+    """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end.
 
     Args:
-        setup: how fast and how far servos may be moved, and the tables by which the device reports its angles.
-        device: opened by ``open``.
-        servos: tables and their boards' clocks by joint: what angles are turned into pulses by.
-        gate: asked in every step.
+        setup: which pulses may be set, and the tables by which the device has its angles.
+        device: whose pulses are set.
+        tables: with their boards' clocks, by joint.
     """
 
-    device: ServoDevice
+    def __init__(self, setup: Setup, device: ServoDevice, tables: Mapping[str, tuple[PulseTable, PulseClock]]) -> None:
+        self._setup, self._device, self._tables = setup, device, tables
+        self._set: dict[str, int] = {}
 
-    def __init__(
-        self, setup: Setup, device: ServoDevice, servos: Mapping[str, tuple[PulseTable, PulseClock]], gate: MotionGate
-    ) -> None:
-        thermal_state = ThermalState(setup.heat, tuple(setup.bench.arm.commanded), setup.base, gate.clock)
-        super().__init__(device, gate.clock, tuple(setup.base), setup.settings.period, thermal_state)
-        self.setup, self.servos, self.gate = setup, servos, gate
-        self.counts: dict[str, int] = {}
-        self.came: dict[str, int] = {}
-        self._guarded: Mapping[str, float] = {}
-        self._rate = math.radians(setup.settings.rate_deg_per_s)  # the fastest, by the stated tables (rad/s)
+    @property
+    @override
+    def joint_names(self) -> tuple[str, ...]:
+        return self._device.joint_names
 
-    def open(self) -> DeviceIdentity:
-        """Open the device and learn which pulses it makes; nothing moves.
-
-        Raises:
-            DeviceRefusedError: it cannot set pulses, or is not the right one.
-        """
-        if not hasattr(self.device, "set_pulse"):
+    @override
+    def open(self, clock: Clock) -> DeviceIdentity:
+        if not hasattr(self._device, "set_pulse"):
             raise DeviceRefusedError(
                 "this device cannot set pulses by their length.", hint="Calibrate servos with a device like pca9685."
             )
-        identity = open_device(self.device, self.clock)
-        self._recovery = Recovery(self.device, identity, self.gate, _LONGEST_LOSS_S)
+        self._set = {}
+        identity = open_device(self._device, clock)
         # A path home of another run must not be gone now.
-        self.device.guard([], self._rate, self.setup.settings.silence)
-        self.counts |= self._running()
+        self._device.guard([], math.radians(self._setup.settings.rate_deg_per_s), self._setup.settings.silence)
         return identity
 
-    @property
-    def angles(self) -> dict[str, float]:
-        """The angles that the pulses ask for by the stated tables (rad, by joint)."""
-        angles = {j: float(self.servos[j][0].angle(self.pulse(j, counts))) for j, counts in self.counts.items()}
-        return {joint: angle for joint, angle in angles.items() if math.isfinite(angle)}
+    @override
+    def state(self) -> DeviceState:
+        state = state_of(self._device)
+        self._set = {joint: _counts(*self._setup.table_of(joint), angle) for joint, angle in state.angles.items()}
+        return DeviceState({joint: self.angle(joint, n) for joint, n in self._set.items()}, state.took_over)
 
-    def counts_at(self, joint: str, angle: float) -> int:
-        """The counts that the stated table gives for an angle (rad)."""
-        return _counts(*self.servos[joint], angle)
+    @override
+    def standing(self, angles: Mapping[str, float]) -> dict[str, float]:
+        return {joint: self.angle(joint, self._allowed(joint, angle)) for joint, angle in angles.items()}
+
+    @override
+    def energise(self, joint: str, angle: float) -> None:
+        self._set_counts(joint, self._allowed(joint, angle))
+
+    @override
+    def command(self, angles: Mapping[str, float]) -> None:
+        for joint, angle in angles.items():
+            if (counts := self._allowed(joint, angle)) != self._set.get(joint):
+                self._set_counts(joint, counts)
+
+    @override
+    def keep_alive(self) -> None:
+        self._device.keep_alive()
+
+    @override
+    def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
+        """The device goes no farther than its own tables."""
+        return self._device.guard([self._own(waypoint) for waypoint in waypoints], rate, after_s)
+
+    @override
+    def release(self, joint: str) -> None:
+        self._set.pop(joint, None)
+        self._device.release(joint)
+
+    @override
+    def close(self) -> None:
+        self._device.close()
+
+    def angle(self, joint: str, counts: int) -> float:
+        """Where a pulse puts a joint by its table (rad)."""
+        return float(self._tables[joint][0].angle(self.pulse(joint, counts)))
 
     def pulse(self, joint: str, counts: int) -> float:
-        return counts * self.servos[joint][1].tick
+        return counts * self._tables[joint][1].tick
 
-    def _counts_per_rad(self, joint: str) -> float:
-        """By the stated table, where it is least."""
-        table, clock = self.servos[joint]
-        return table.least_slope / clock.tick
+    def counts(self, joint: str, angle: float) -> int:
+        """The counts that the table gives for an angle (rad)."""
+        return _counts(*self._tables[joint], angle)
 
-    def approach_counts(self, joint: str) -> int:
-        return max(int(self.setup.settings.approach * self._counts_per_rad(joint)) - 1, 1)
+    def turn_counts(self, joint: str, turn: float) -> int:
+        """The counts of a turn (rad) where the table has least."""
+        table, clock = self._tables[joint]
+        return max(int(turn * table.least_slope / clock.tick) - 1, 1)
 
-    def energise(self, joint: str, counts: int) -> None:
-        """A joint's first pulse; nothing if it gets pulses already."""
-        if joint not in self.counts:
-            self._set(joint, counts)
-            self.stand(_BETWEEN_JOINTS_S, self.gate.resting)
+    def rises(self, joint: str) -> bool:
+        pulses = self._tables[joint][0].pulses
+        return pulses[0] < pulses[-1]
 
-    def go(self, joint: str, counts: int) -> None:
-        """Move a joint to a pulse, no faster than allowed.
+    def _own(self, angles: Mapping[str, float]) -> dict[str, float]:
+        """Angles as the device has them, within its tables."""
+        own = {}
+        for joint, angle in angles.items():
+            table = self._setup.table_of(joint)[0]
+            same = float(table.angle(self.pulse(joint, self.counts(joint, angle))))
+            own[joint] = min(max(same, table.angles[0]), table.angles[-1])
+        return own
 
-        Raises:
-            InputError: the pulse is outside the range that is allowed.
-            StopRequested: on the way; the joint holds.
-        """
-        self.check(joint, counts)
-        at, step = float(self.counts[joint]), self._rate * self._counts_per_rad(joint) * self.period
-        if counts != self.counts[joint]:
-            self.came[joint] = 1 if counts > at else -1
-        while self.counts[joint] != counts:
-            self.tick(self.gate.resting)
-            at += math.copysign(min(step, abs(counts - at)), counts - at)
-            if (near := math.floor(at + 0.5)) != self.counts[joint]:
-                self._set(joint, near)
-
-    def come_to(self, joint: str, counts: int, came: int) -> None:
-        """Move a joint to a pulse with rising pulses (1) or falling ones (-1), with its play taken up; see ``go``."""
-        aside = counts - came * self.approach_counts(joint)
-        if came * (aside - self.counts[joint]) < 0 or self.came.get(joint) != came:
-            self.go(joint, aside)
-        self.go(joint, counts)
-
-    def check(self, joint: str, counts: int) -> None:
-        """Whether a pulse is allowed.
+    def _allowed(self, joint: str, angle: float) -> int:
+        """The counts for an angle (rad).
 
         Raises:
-            InputError: it is not.
+            DeviceRefusedError: the pulse is outside the range that is allowed.
         """
-        low, high = self.setup.pulses_of(joint)
+        counts, (low, high) = self.counts(joint, angle), self._setup.pulses_of(joint)
         if not low <= self.pulse(joint, counts) <= high:
-            raise InputError(
+            raise DeviceRefusedError(
                 f"{joint}: found a pulse of {1e6 * self.pulse(joint, counts):.0f} us, expected {1e6 * low:.0f} to "
                 f"{1e6 * high:.0f} us.",
                 hint="Narrow bench.servo.ranges; or widen bench.servo.pulses or its pulse_range if the servo bears it.",
             )
+        return counts
 
-    def to_base(self) -> None:
-        """Every servo to the base pose, one by one; those without pulses get their first.
-
-        Raises:
-            DeviceRefusedError: no order of the joints keeps clear on the way from where the arm stands.
-        """
-        setup = self.setup
-        goals = {joint: self.counts_at(joint, angle) for joint, angle in setup.base.items()}
-        for joint, counts in goals.items():
-            self.energise(joint, counts)
-        start = self.angles
-        away = [joint for joint, counts in goals.items() if self.counts[joint] != counts]
-        for order in permutations(away):
-            arrived = [{**start, **{joint: setup.base[joint] for joint in order[:n]}} for n in range(len(order) + 1)]
-            if all(setup.clear_between(here, there) for here, there in pairwise(arrived)):
-                for joint in order:
-                    self.go(joint, goals[joint])
-                return
-        hint = "Bring it nearer by armcal servo --guided, or release it and put it there by hand."
-        raise DeviceRefusedError("no way to the base pose is clear from where the arm stands.", hint=hint)
-
-    def guard(self, base: Mapping[str, float]) -> bool:
-        """What the board is to do when the host falls silent: back to a pose (rad by joint), slowly."""
-        self._guarded = dict(base)
-        return self.device.guard([base] if base else [], self._rate, self.setup.settings.silence)
-
-    def hold(self) -> bool:
-        """The board is to stay where it is when the host falls silent. False: the board is lost."""
-        try:
-            self.guard({})
-        except DeviceError:
-            return False
-        return True
-
-    def persist(self, action: Callable[[], T]) -> T:
-        """Do it; when the device fails, open it again, let every joint have the pulse that it had, and do it again.
-
-        Raises:
-            DeviceLost: it does not come back.
-        """
-        return self._recovery.persist(action, self._restore)
-
-    def _restore(self) -> None:
-        # No way home is known while joints hang free.
-        self.device.guard([], self._rate, self.setup.settings.silence)
-        before, running = dict(self.counts), self._running()
-        self.counts |= running
-        self.came.clear()
-        for joint in before:
-            if joint not in running:
-                self._set(joint, before[joint])
-                self.stand(_BETWEEN_JOINTS_S, self.gate.resting)
-        if self._guarded:
-            self.guard(self._guarded)
-
-    def _running(self) -> dict[str, int]:
-        angles = state_of(self.device).angles
-        moved = {joint: angle for joint, angle in angles.items() if joint in self.setup.base}
-        return {joint: _counts(*self.setup.table_of(joint), angle) for joint, angle in moved.items()}
-
-    def _set(self, joint: str, counts: int) -> None:
-        self.check(joint, counts)
-        self.device.set_pulse(joint, self.pulse(joint, counts))
-        self.counts[joint] = counts
+    def _set_counts(self, joint: str, counts: int) -> None:
+        self._device.set_pulse(joint, self.pulse(joint, counts))
+        self._set[joint] = counts
 
 
 def _counts(table: PulseTable, clock: PulseClock, angle: float) -> int:

@@ -13,8 +13,8 @@ from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
 from scipy.spatial.transform import Rotation
 
-from armcal_bench.servo.nominal import NominalArm, turn_of_point, twist_angles
 from armcal_bench.servo.record import BEGUN, POSE
+from armcal_bench.servo.rigid_arm import RigidArm, turn_of_point, twist_angles
 from armcal_bench.settling import pose_of
 
 _LEVER_M = 0.1
@@ -100,7 +100,7 @@ class _Wiring:
         return {self.moves[joint]: self.signs[joint] * angle for joint, angle in base.items()}
 
 
-def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> list[Verdict]:
+def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
     """What each joint did, by all that was seen together.
 
     A swapped or reversed servo stands elsewhere in the base pose too, so that the axes of the joints after it are not
@@ -136,7 +136,7 @@ def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: NominalArm
     return verdicts
 
 
-def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nominal: NominalArm) -> dict[str, str]:
+def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nominal: RigidArm) -> dict[str, str]:
     """Why the tables of joints cannot be what a record has under their names, by joint: servos on others' channels."""
     moves = []
     for joint in joints:
@@ -167,7 +167,7 @@ def permuted(entries: Sequence[Mapping[str, Any]], joints: Sequence[str], nomina
     }
 
 
-def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: NominalArm) -> float:
+def _score(wiring: _Wiring, seen: Sequence[Move], base: Mapping[str, float], nominal: RigidArm) -> float:
     axes = nominal.axes(wiring.pose(base))
     score = _EACH_FAULT * wiring.faults
     for move in seen:

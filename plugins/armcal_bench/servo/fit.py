@@ -1,0 +1,466 @@
+"""Pulse tables, backlash and springs from what a tracker, or somebody, saw of each joint's sweep.
+
+All sweeps are one problem of the arm's model: each joint stands where its table puts the pulse, with corrections at the
+table's knots, less half the backlash behind where it came from. The model's axes and springs move with them, every
+number near its nominal value: what springs give is computed by the model, and a model whose axes point a few degrees
+elsewhere computes it wrong. The corrections move the tables until nothing remains to correct.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.servo import PulseClock, PulseTable
+from armcal.base.arrays import Array, Mask
+from armcal.base.poses import NO_TURN
+from armcal.base.quaternions import quaternion_of
+from armcal.errors import NotConvergedError
+from armcal.measure.rests import mean_rotation
+from armcal.run.experiment import Experiment
+from scipy.spatial.transform import Rotation
+
+from armcal_bench.servo.record import ANGLE, POSE
+from armcal_bench.servo.rigid_arm import RigidArm, lever, turn_of_point, twist_angles
+from armcal_bench.servo.setup import ServoCalibrationSettings
+from armcal_bench.servo.sighting import BODY, TABLES, Body, BodyFit, Corrections, Seen
+from armcal_bench.servo.tables import FittedServo, KnownServo, Outcome, Zero, piecewise
+from armcal_bench.servo.trial import permuted
+
+Entry = Mapping[str, Any]
+WEAK_SD = 0.6
+"""How far a table's angle may well be off (rad): what no observation determines stays as stated."""
+_ZERO_SD, _ANGLE_SD, _FRAME_SD, _PLAY_SD = 10.0, math.radians(4.0), math.radians(4.0), math.radians(0.15)
+_LENGTH_SD_M, _SHIFT_SD_M, _TARGET_SD_M, _FIXED_SD = 0.005, 0.05, 0.1, 1e-6
+_LEAST_SEEN_M, _LEAST_TURN = 1e-4, math.radians(1.0)
+_OFF_AXIS = 0.5  # Of the turns about the joint's axis: more is another joint's
+_ROUNDS, _STEADY = 8, 1e-6
+_FAR_OFF = 5.0
+_MOST_SCATTER = math.radians(1.0)
+_DETERMINED = 0.2  # Of the deviation that was assumed: below it the observations determine the number
+_NO_TABLE = "its angles neither rise nor fall with the pulse, as if it slipped, or was too hot and let go"
+_CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
+
+
+@dataclass(eq=False)
+class _Sweep:
+    """What was observed of a joint, and the table that explains it so far.
+
+    Attributes:
+        pulses: of the table at the servo's knots (counts).
+        zero: what is added to the table's angles (rad).
+        kept: which lines count.
+    """
+
+    known: KnownServo
+    lines: Sequence[Entry]
+    by: str
+    poses: Array  # base_T_body (N x 4 x 4)
+    sds: Array  # of the angle (rad)
+    axis: Array  # of the joint, by the model (base frame)
+    arms: Array  # from the axis to the body (N x 3, m)
+    pulses: Array
+    kept: Mask
+    zero: float = 0.0
+
+    @property
+    def counts(self) -> Array:
+        return np.array([float(line["counts"]) for line in self.lines])
+
+    @property
+    def falls(self) -> bool:
+        return bool(self.pulses[-1] < self.pulses[0])
+
+    @property
+    def approaches(self) -> Array:
+        """From where the angle came: 1 from below."""
+        return np.array([float(line["came"]) for line in self.lines]) * (-1 if self.falls else 1)
+
+    @property
+    def angles(self) -> Array:
+        """Where the table puts the pulses (rad)."""
+        rising = slice(None, None, -1 if self.falls else 1)
+        return np.asarray(piecewise(self.pulses[rising], self.known.angles[rising])(self.counts))
+
+    @property
+    def is_table(self) -> bool:
+        steps = np.diff(self.pulses)
+        return bool(np.all(steps > 0) or np.all(steps < 0))
+
+    def corrected(self, at: Array) -> bool:
+        """Move the table so that its pulses are those of angles that are ``at`` beyond the knots; whether it is one."""
+        angles = self.known.angles + at
+        if np.all(np.diff(angles) > 0):
+            self.pulses = np.asarray(piecewise(angles, self.pulses)(self.known.angles))
+        return bool(np.all(np.diff(angles) > 0)) and self.is_table
+
+    def along(self, residuals: Array) -> Array:
+        """What residuals of the body are as turns about the joint's axis (N, rad)."""
+        if self.by == "position":
+            return np.asarray(np.einsum("ni,in->n", lever(self.arms, self.axis), residuals))
+        return np.asarray(np.einsum("nji,j,in->n", self.poses[:, :3, :3], self.axis, residuals))
+
+
+def outcome_of(
+    entries: Sequence[Entry],
+    servos: Sequence[KnownServo],
+    clocks: Mapping[str, PulseClock],
+    experiment: Experiment,
+    arm: Arm,
+    settings: ServoCalibrationSettings,
+) -> Outcome:
+    """Fit all that a record holds of some servos.
+
+    One whose angles scatter as no servo's do is left out: it has let go, and would spoil the estimate of the springs.
+    """
+    rigid = RigidArm(arm, experiment.parameters)
+    left_out = permuted(entries, [servo.joint for servo in servos], rigid)
+    while True:
+        remaining = [servo for servo in servos if servo.joint not in left_out]
+        swept = {servo.joint: _sweep_of(entries, servo, clocks, rigid, settings) for servo in remaining}
+        silent = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, str)}
+        sweeps = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, _Sweep)}
+        outcome = _fitted(sweeps, clocks, rigid, experiment, arm, settings)
+        worst = max(outcome.servos.values(), key=lambda servo: servo.scatter, default=None)
+        if worst is None or worst.scatter <= _MOST_SCATTER:
+            return replace(outcome, silent={**outcome.silent, **silent, **left_out})
+        left_out[worst.known.joint] = (
+            f"the spread of its angles is {math.degrees(worst.scatter):.1f} deg, as if it slipped, or "
+            "was too hot and let go"
+        )
+
+
+def _sweep_of(
+    entries: Sequence[Entry],
+    servo: KnownServo,
+    clocks: Mapping[str, PulseClock],
+    rigid: RigidArm,
+    settings: ServoCalibrationSettings,
+) -> _Sweep | str:
+    """A joint's lines and a first table, or why they show none."""
+    joint, tick = servo.joint, clocks[servo.board].tick
+    lines = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
+    seen = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
+    stated = servo.pulses_at(servo.angles) / tick
+    if not lines and not seen:
+        return "nothing was measured"
+    if not lines:  # somebody put the joint there: as if a tracker had seen the model's tool
+        poses = np.array([rigid.tool({joint: line["target"]}) for line in seen])
+        sds, axis = np.array([line["sd"] for line in seen]), rigid.axis(joint, {})[0]
+        everything, targets = np.ones(len(seen), dtype=bool), np.array([line["target"] for line in seen])
+        sweep = _Sweep(servo, seen, "somebody", poses, sds, axis, poses[:, :3, 3], stated, everything)
+        return _with_first_table(sweep, targets, stated)
+    others = _others(lines, joint)
+    axis, origin = rigid.axis(joint, {**others, joint: 0.0})
+    poses = np.tile(np.eye(4), (len(lines), 1, 1))
+    poses[:, :3, 3] = [line["position"] for line in lines]
+    by = "position" if any(line["rotation"] is None for line in lines) else "rotation"
+    poses[:, :3, :3] = [np.full((3, 3), np.nan) if line["rotation"] is None else line["rotation"] for line in lines]
+    deviations = np.array([[d or 0.0 for d in line["deviations"]] for line in lines])
+    arms = poses[:, :3, 3] - origin
+    counts = np.array([line["counts"] for line in lines])
+    table = PulseTable(servo.table.angles, servo.table.pulses)
+    commanded = np.array([float(table.angle(count * tick)) for count in counts])
+    middle = int(np.argmin(np.abs(commanded - others.get(joint, 0.0))))
+    if by == "rotation":
+        turns = Rotation.from_matrix(poses[:, :3, :3] @ poses[middle, :3, :3].T)
+        turned = twist_angles(turns, axis)
+        off = (turns * Rotation.from_rotvec(-np.outer(turned, axis))).magnitude()
+        if np.ptp(turned) < _LEAST_TURN and np.ptp(turns.magnitude()) < _LEAST_TURN:
+            return f"the tool turned by {math.degrees(np.ptp(turned)):.2f} deg in all"
+        if np.sqrt(np.mean(off**2)) > _OFF_AXIS * np.sqrt(np.mean(turned**2)):
+            return f"the tool did not turn about this joint's axis: {_CHECK_IT}"
+        sds = np.linalg.norm(np.einsum("nji,j->ni", poses[:, :3, :3], axis) * deviations[:, 3:], axis=1)
+    else:
+        radii = np.linalg.norm(arms - np.outer(arms @ axis, axis), axis=1)
+        if np.median(radii) < settings.least_radius:
+            return f"the target moves on a circle of {1000 * np.median(radii):.1f} mm about this joint's axis"
+        turned = np.array([turn_of_point(arms[middle], place, axis) for place in arms])
+        sds = np.maximum(np.sqrt(np.mean(deviations[:, :3] ** 2, axis=1)), _LEAST_SEEN_M) / np.median(radii)
+    sds = np.hypot(sds, settings.rotation_sd)
+    sweep = _Sweep(servo, lines, by, poses, sds, axis, arms, stated, np.ones(len(lines), dtype=bool))
+    return _with_first_table(sweep, commanded[middle] + turned, stated)
+
+
+def _with_first_table(sweep: _Sweep, angles: Array, stated: Array) -> _Sweep | str:
+    """The table of least squares through angles (rad), near the stated one where none is."""
+    knots = sweep.known.angles
+    weight = 1e-3
+    rows = np.vstack(
+        [piecewise(knots, np.eye(len(knots)))(angles).reshape(-1, len(knots)), weight * np.eye(len(knots))]
+    )
+    sweep.pulses = np.linalg.lstsq(rows, np.concatenate([sweep.counts, weight * stated]), rcond=None)[0]
+    return sweep if sweep.is_table else _NO_TABLE
+
+
+def _others(lines: Sequence[Entry], joint: str) -> dict[str, float]:
+    """Where the other joints stood: the median, since each had the same pulse every time."""
+    names = sorted({name for line in lines for name in line["told"]})
+    return {n: float(np.median([line["told"][n] for line in lines if n in line["told"]])) for n in names if n != joint}
+
+
+def _fitted(
+    sweeps: Mapping[str, _Sweep],
+    clocks: Mapping[str, PulseClock],
+    rigid: RigidArm,
+    experiment: Experiment,
+    arm: Arm,
+    settings: ServoCalibrationSettings,
+) -> Outcome:
+    """Sweeps of a tracker's rotations have a problem, those of its positions one, and each of somebody's eyes."""
+    tracked = all(sweep.by != "somebody" for sweep in sweeps.values())
+    zero: Zero = "kept" if settings.zero == "kept" and tracked else "measured"
+    servos: dict[str, FittedServo] = {}
+    silent: dict[str, str] = {}
+    compliances: dict[str, tuple[float, float]] = {}
+    spans: dict[str, float] = {}
+    together: dict[tuple[str, str], dict[str, _Sweep]] = {}
+    for joint, sweep in sweeps.items():
+        together.setdefault((sweep.by, joint if sweep.by == "somebody" else ""), {})[joint] = sweep
+    for own in together.values():
+        fit = _TableFit(own, rigid, experiment, arm, settings, zero, clocks)
+        silent |= fit.run()
+        servos |= {joint: fit.servo(joint) for joint in own if joint not in silent}
+        compliances |= fit.compliances()
+        spans |= fit.sag_spans()
+    known = {name: change for name, change in compliances.items() if change[1] < _DETERMINED * settings.sag_sd}
+    fitted = settings.sag == "fitted"
+    undetermined = tuple(name for name in compliances if name not in known and fitted)
+    return Outcome(servos, clocks, silent, known if fitted else {}, undetermined, zero, spans)
+
+
+class _TableFit:
+    """Sweeps that the same of the body shows, fitted together."""
+
+    def __init__(
+        self,
+        sweeps: dict[str, _Sweep],
+        rigid: RigidArm,
+        experiment: Experiment,
+        arm: Arm,
+        settings: ServoCalibrationSettings,
+        zero: Zero,
+        clocks: Mapping[str, PulseClock],
+    ) -> None:
+        self._ticks = {joint: clocks[sweep.known.board].tick for joint, sweep in sweeps.items()}
+        self._sweeps, self._rigid, self._arm, self._settings = sweeps, rigid, arm, settings
+        self._by = next(iter(sweeps.values())).by
+        self._keeps_zero = zero == "kept"
+        self._has_zero = self._by != "somebody"
+        self._numbers = {joint: arm.joint_names.index(joint) + 1 for joint in sweeps}
+        lags = [self._numbers[j] for j, s in sweeps.items() if len(np.unique(s.approaches)) > 1]
+        self._lags = {joint for joint, number in self._numbers.items() if number in lags}
+        knots = {self._numbers[joint]: sweep.known.angles.tolist() for joint, sweep in sweeps.items()}
+        corrections = Corrections(knots, list(self._numbers.values()) if self._has_zero else [], lags)
+        by: Literal["rotation", "position"] = "position" if self._by == "position" else "rotation"
+        seat = quaternion_of(mean_rotation(self._seats())) if self._by == "rotation" else NO_TURN
+        body = Body((arm.name,), by, seat, sweeps=len(sweeps))
+        has_springs = self._has_zero and settings.sag != "none"
+        free = self._free(experiment, body, corrections, has_springs)
+        self._fit = BodyFit(experiment, arm, corrections, body, free, self._seen(), springs=has_springs)
+        for joint in sweeps if self._has_zero else ():
+            self._fit.move(self._zero(joint), self._zeroed(joint))
+        self._compliances = [name for name in free if name.startswith(f"{arm.name}.") and self._is_compliance(name)]
+
+    def _zeroed(self, joint: str) -> float:
+        """By how much the angles of a first table are beyond those by which its pulse at zero is the stated one (rad).
+
+        The table is moved by that, where zeros are kept.
+        """
+        sweep = self._sweeps[joint]
+        if not self._keeps_zero:
+            return 0.0
+        knots, rising = sweep.known.angles, slice(None, None, -1 if sweep.falls else 1)
+        stated = float(sweep.known.pulses_at(np.zeros(1))[0]) / self._ticks[joint]
+        beyond = float(piecewise(sweep.pulses[rising], knots[rising])(stated))
+        sweep.pulses = np.asarray(piecewise(knots - beyond, sweep.pulses)(knots))
+        return beyond
+
+    def _is_compliance(self, name: str) -> bool:
+        block = self._fit.parameters[name]
+        return block.unit == "rad_per_Nm" and block.size == 1
+
+    def _free(
+        self, experiment: Experiment, body: Body, corrections: Corrections, springs: bool
+    ) -> dict[str, float | None]:
+        arm, settings = self._arm, self._settings
+        own = {block.name: block.name.rpartition(".")[2] for block in arm.parameters()}
+        free: dict[str, float | None] = {}
+        for block in corrections.parameters():
+            sd = _ZERO_SD if block.name.startswith("zero") else None if block.name.startswith("lag") else WEAK_SD
+            free[f"{arm.name}.{TABLES}.{block.name}"] = sd
+        if self._by == "somebody":
+            return free
+        scope = f"{arm.name}.{arm.model_name}."
+        nominal = {block.name: block for block in experiment.parameters.blocks if block.name in own}
+        springy = {f"{arm.name}.{name}." for name in arm.effects} if springs else set()
+        for name, block in nominal.items():
+            if block.size == 1 and block.unit == "rad" and name.startswith(scope):
+                free[name] = _ANGLE_SD
+            elif block.unit == "m" and block.size == 1 and name.startswith(scope) and self._by == "position":
+                free[name] = _LENGTH_SD_M
+            elif block.unit == "rad_per_Nm" and block.size == 1 and any(name.startswith(s) for s in springy):
+                free[name] = settings.sag_sd if settings.sag == "fitted" else _FIXED_SD
+        frame = {"tilt": _FRAME_SD, "before": _PLAY_SD, "behind": _PLAY_SD}
+        if self._by == "position":
+            frame |= {"shift": _SHIFT_SD_M}
+        for block in body.parameters():
+            kind = block.name.rstrip("0123456789_xyz")
+            if kind in frame:
+                free[f"{BODY}.{block.name}"] = frame[kind]
+            elif kind == "seat" and self._by == "position":
+                free[f"{BODY}.{block.name}"] = _TARGET_SD_M
+        if self._by == "rotation":
+            free[f"{BODY}.seat_rotation"] = None
+        return free
+
+    def _seats(self) -> Array:
+        """How the body sits on the nominal tool, line by line."""
+        return np.array(
+            [
+                self._rigid.tool({**line.get("told", {}), joint: angle})[:3, :3].T @ pose[:3, :3]
+                for joint, sweep in self._sweeps.items()
+                for line, angle, pose in zip(sweep.lines, sweep.angles, sweep.poses, strict=True)
+            ]
+        )
+
+    def _seen(self) -> Seen:
+        joints = list(self._arm.commanded)
+        rows: dict[str, list[Array]] = {joint: [] for joint in joints}
+        sides: dict[str, list[Array]] = {joint: [] for joint in joints}
+        for joint, sweep in self._sweeps.items():
+            for other in joints:
+                own = other == joint
+                stood = np.array([float(line.get("told", {}).get(other, 0.0)) for line in sweep.lines])
+                rows[other].append(sweep.angles if own else stood)
+                sides[other].append(sweep.approaches if own else np.zeros(len(stood)))
+        sweeps = list(self._sweeps.values())
+        noise = np.concatenate([s.sds * self._length(s) for s in sweeps])
+        numbers = np.repeat(np.arange(len(sweeps), dtype=float), [len(s.lines) for s in sweeps])
+        angles, approaches = ({j: np.concatenate(parts) for j, parts in of.items()} for of in (rows, sides))
+        return Seen(angles, np.concatenate([s.poses for s in sweeps]), noise, approaches, numbers)
+
+    def _length(self, sweep: _Sweep) -> float:
+        """By which an angle about the joint becomes what is compared: a radius (m), or one."""
+        if sweep.by != "position":
+            return 1.0
+        return float(np.median(np.linalg.norm(sweep.arms - np.outer(sweep.arms @ sweep.axis, sweep.axis), axis=1)))
+
+    def _parts(self, rows: Array) -> dict[str, Array]:
+        """Columns of all records, joint by joint."""
+        ends = np.cumsum([len(sweep.lines) for sweep in self._sweeps.values()])[:-1]
+        return dict(zip(self._sweeps, np.split(rows, ends, axis=-1), strict=True))
+
+    def run(self) -> dict[str, str]:
+        """Until the tables are steady; why some joints have none."""
+        silent: dict[str, str] = {}
+        for _ in range(_ROUNDS):
+            for _ in range(2):  # without what lies far off, and with what does so no longer
+                try:
+                    self._fit.fit(self._seen(), np.concatenate([s.kept for s in self._sweeps.values()]).astype(float))
+                except NotConvergedError as fault:
+                    return dict.fromkeys(self._sweeps, fault.message.rstrip("."))
+                before = [sweep.kept for sweep in self._sweeps.values()]
+                for sweep, off in zip(self._sweeps.values(), self._off().values(), strict=True):
+                    limit = _FAR_OFF * max(1.0, 1.4826 * float(np.median(np.abs(off / sweep.sds))))
+                    sweep.kept = np.abs(off / sweep.sds) <= limit
+                if all(np.array_equal(a, s.kept) for a, s in zip(before, self._sweeps.values(), strict=True)):
+                    break
+            largest = 0.0
+            for joint, sweep in self._sweeps.items():
+                names = self._names(joint)
+                at = np.array([self._fit.value(name) for name in names])
+                at = at - self._pinned(joint) @ at
+                largest = max(largest, float(np.abs(at).max()))
+                if not sweep.corrected(at):
+                    silent[joint] = _NO_TABLE
+                elif self._has_zero:
+                    moved = self._fit.value(names[0]) - at[0]
+                    self._fit.move(self._zero(joint), self._fit.value(self._zero(joint)) + moved)
+                for name in names:
+                    self._fit.move(name, 0.0)
+            if largest < _STEADY:
+                break
+        return silent
+
+    def _names(self, joint: str) -> list[str]:
+        scope, number = f"{self._arm.name}.{TABLES}.", self._numbers[joint]
+        return [f"{scope}at{number}_{k}" for k in range(len(self._sweeps[joint].known.angles))]
+
+    def _zero(self, joint: str) -> str:
+        return f"{self._arm.name}.{TABLES}.zero{self._numbers[joint]}"
+
+    def _pinned(self, joint: str) -> Array:
+        """What of the corrections at the knots is the joint's zero instead: that at zero, or their mean."""
+        sweep = self._sweeps[joint]
+        hats = piecewise(sweep.known.angles, np.eye(len(sweep.known.angles)))
+        if not self._has_zero:
+            return np.zeros(len(sweep.known.angles))
+        return np.asarray(hats(0.0) if self._keeps_zero else hats(sweep.angles).mean(axis=0))
+
+    def _off(self) -> dict[str, Array]:
+        """What is left of each angle (rad)."""
+        parts = self._parts(self._fit.residuals())
+        return {joint: sweep.along(parts[joint]) for joint, sweep in self._sweeps.items()}
+
+    def servo(self, joint: str) -> FittedServo:
+        """By the last fit; pulses by the stated oscillator."""
+        tick = self._ticks[joint]
+        sweep, names, off = self._sweeps[joint], self._names(joint), self._off()[joint]
+        lag_name = f"{self._arm.name}.{TABLES}.lag{self._numbers[joint]}"
+        used = int(sweep.kept.sum())
+        freedom = used - len(names) - (joint in self._lags) - self._has_zero
+        sizes = (off / sweep.sds)[sweep.kept]
+        scale = float(np.sqrt(sizes @ sizes / freedom)) if freedom > 0 else 1.0
+        rows = np.eye(len(names)) - self._pinned(joint)
+        slopes = np.abs(np.gradient(sweep.pulses, sweep.known.angles)) * tick
+        shift = self._absolute(joint)
+        pulses = sweep.pulses * tick
+        if shift:
+            pulses = np.asarray(piecewise(sweep.known.angles + shift, pulses)(sweep.known.angles))
+        sds = slopes * self._fit.deviations(names, rows) * max(1.0, scale)
+        determined = sds < _DETERMINED * WEAK_SD * slopes
+        stated = sweep.known.pulses_at(sweep.known.angles)
+        lag = self._fit.value(lag_name) if joint in self._lags else None
+        lag_sd = float(self._fit.deviations([lag_name])[0]) * max(1.0, scale) if joint in self._lags else math.nan
+        angles = sweep.angles + shift - (lag or 0.0) * sweep.approaches
+        return FittedServo(
+            known=sweep.known,
+            angles=tuple(sweep.known.angles.tolist()),
+            pulses=tuple(np.where(determined, pulses, stated).tolist()),
+            pulse_sds=tuple(np.where(determined, sds, np.nan).tolist()),
+            determined=tuple(determined.tolist()),
+            lag=lag,
+            lag_sd=lag_sd,
+            scatter=float(np.sqrt(np.mean(off[sweep.kept] ** 2))) if used else 0.0,
+            scale=scale,
+            used=used,
+            outliers=tuple((int(sweep.counts[i]), float(angles[i] + off[i])) for i in np.flatnonzero(~sweep.kept)),
+            reach=(float(angles[sweep.kept].min()), float(angles[sweep.kept].max())) if used else (0.0, 0.0),
+            by=sweep.by,
+        )
+
+    def _absolute(self, joint: str) -> float:
+        """What is to be added to the table's angles for them to be absolute, by the stated model and base."""
+        if self._keeps_zero or not self._has_zero:
+            return 0.0
+        parameters, fitted = self._fit.parameters, (*self._compliances, *self._names(joint))
+        lags = f"{self._arm.name}.{TABLES}.lag"
+        stated = {b.name: b.nominal for b in parameters.free if b.name not in fitted and not b.name.startswith(lags)}
+        stated |= {f"{BODY}.seat_rotation": NO_TURN} if self._by == "rotation" else {}
+        sweep = self._sweeps[joint]
+        return float(np.mean(sweep.along(self._parts(self._fit.residuals(stated))[joint])[sweep.kept]))
+
+    def compliances(self) -> dict[str, tuple[float, float]]:
+        if not self._compliances:
+            return {}
+        sds = (self._fit.deviations(self._compliances) * self._fit.noise_scale).tolist()
+        return {n: (self._fit.value(n), sd) for n, sd in zip(self._compliances, sds, strict=True)}
+
+    def sag_spans(self) -> dict[str, float]:
+        """How much what the springs give varies over each sweep (rad)."""
+        stiff = self._fit.residuals(dict.fromkeys(self._compliances, 0.0)) - self._fit.residuals()
+        parts = self._parts(stiff)
+        return {joint: float(np.ptp(sweep.along(parts[joint]))) for joint, sweep in self._sweeps.items()}

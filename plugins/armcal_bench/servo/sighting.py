@@ -1,0 +1,233 @@
+"""Joints that stand off their commands, and a tracked body on the tool: what servo fits add to the arm's own problem.
+
+One problem of the arm's model serves all of them: pulse tables, backlash and springs of a calibration, and the zeros of
+servos that know where they stand.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from armcal.arm.assembly import Arm, ArmState, prefixed, scoped
+from armcal.arm.effects import EffectSettings, JointCommand, JointEffect
+from armcal.arm.servo import piecewise_linear
+from armcal.base.arrays import Array
+from armcal.base.dataset import Dataset
+from armcal.base.parameters import ParameterBlock, Parameters, declared, scalar
+from armcal.base.poses import point_blocks, point_expression, pose_blocks, pose_transform, rotation_of
+from armcal.base.quaternions import quaternion_of
+from armcal.base.se3 import rotation_vector, small_rotation
+from armcal.estimate.identifiability import InverseInformation
+from armcal.estimate.polish import descended
+from armcal.measure.measurement import Channel
+from armcal.problem.problem import PosedProblem, Problem
+from armcal.run.experiment import Experiment
+from typing_extensions import override
+
+By = Literal["rotation", "position", "pose"]  # What of the body is compared
+TABLES, BODY = "tables", "body"
+_SCALE_RAD = 0.05
+_MOST_STEPS, _DAMPING, _AT_REST = 40, 1e-6, 1e-9
+_QUATERNION = ("qw", "qx", "qy", "qz")
+
+
+class Corrections(JointEffect):
+    """The effect ``tables``: joints stand off their commands.
+
+    ``at3_0``, ``at3_1``, ... (rad) are what joint 3 stands off at the knots, linear between them; ``zero3`` is the same
+    everywhere; it stops ``lag3`` short of its command when it comes from below, and as much beyond from above.
+
+    Args:
+        knots: angles (rad) by joint number (from 1).
+        zeros: joints that have a zero of their own beside.
+        lags: joints that came from both sides.
+    """
+
+    def __init__(self, knots: Mapping[int, Sequence[float]], zeros: Sequence[int], lags: Sequence[int]) -> None:
+        super().__init__(EffectSettings(), ())
+        self._knots, self._zeros, self._lags = knots, zeros, lags
+
+    @override
+    def parameters(self) -> Sequence[ParameterBlock]:
+        names = [f"at{joint}_{k}" for joint, knots in self._knots.items() for k in range(len(knots))]
+        names += [*(f"zero{joint}" for joint in self._zeros), *(f"lag{joint}" for joint in self._lags)]
+        return [scalar(name, "rad", 0.0, _SCALE_RAD) for name in names]
+
+    @override
+    def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
+        joint, moved = command.joint, ca.SX(0)
+        if knots := self._knots.get(joint):
+            at = [values[f"at{joint}_{k}"] for k in range(len(knots))]
+            moved += piecewise_linear(command.commanded, knots, at)
+        if joint in self._zeros:
+            moved += values[f"zero{joint}"]
+        return moved - values[f"lag{joint}"] * command.approach if joint in self._lags else moved
+
+
+@dataclass(frozen=True)
+class Body:
+    """A measurement of a body on the tool, in a frame that may be tilted against the model's base.
+
+    Parameters: ``tilt`` and ``shift`` of that frame, ``seat`` of the body on the tool; and of each sweep small turns
+    before and behind the joint that moves, for the others stand within their play then.
+    """
+
+    arms: tuple[str, ...]
+    by: By
+    seat: tuple[float, ...]  # its nominal rotation (unit quaternion w, x, y, z)
+    target: tuple[float, ...] = (0.0, 0.0, 0.0)  # its nominal place (3, m)
+    sweeps: int = 0
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        turns = ["tilt", *(f"{side}{i}" for i in range(self.sweeps) for side in ("before", "behind"))]
+        angles = tuple(scalar(f"{turn}_{axis}", "rad", 0.0, _SCALE_RAD) for turn in turns for axis in "xyz")
+        return (*angles, *point_blocks("shift", (0.0, 0.0, 0.0)), *pose_blocks("seat", self.target, self.seat))
+
+    def channels(self) -> tuple[Channel, ...]:
+        return (
+            *(Channel(axis, "length") for axis in "xyz"),
+            *(Channel(name, "dimensionless") for name in _QUATERNION),
+            Channel("sweep", "dimensionless"),
+        )
+
+    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        return {}
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """Measured less predicted: a rotation vector in the predicted body's axes (rad), a place in the base's (m)."""
+
+        def turn(name: str) -> Any:
+            return small_rotation(ca.vertcat(*[values[f"{name}_{axis}"] for axis in "xyz"]))
+
+        before = behind = ca.SX.zeros(3)
+        for i in range(self.sweeps):
+            own = measured["sweep"] == i
+            before += own * point_expression(f"before{i}", values)
+            behind += own * point_expression(f"behind{i}", values)
+        tool, seat = arms[self.arms[0]].base_T_tool, pose_transform("seat", values)
+        base = ca.mtimes(turn("tilt"), small_rotation(before))
+        rows = []
+        if self.by != "position":
+            read = rotation_of(ca.vertcat(*[measured[name] for name in _QUATERNION]))
+            predicted = ca.mtimes([base, tool.rotation, small_rotation(behind), seat.rotation])
+            rows.append(rotation_vector(ca.mtimes(predicted.T, read)))
+        if self.by != "rotation":
+            place = ca.mtimes(base, tool.apply(ca.mtimes(small_rotation(behind), seat.translation)))
+            read = ca.vertcat(*[measured[axis] for axis in "xyz"])
+            rows.append(read - place - point_expression("shift", values))
+        return ca.vertcat(*rows)
+
+    def dimensions(self) -> tuple[str, ...]:
+        return {"rotation": ("angle",) * 3, "position": ("length",) * 3}.get(self.by, ("angle",) * 3 + ("length",) * 3)
+
+    def noise(self) -> tuple[float, ...]:
+        return (1.0,) * len(self.dimensions())
+
+    def noise_channels(self) -> tuple[tuple[Channel, ...], ...]:
+        """Each record has its own, as ``noise_rotation`` and ``noise``."""
+        named = {"angle": Channel("noise_rotation", "angle"), "length": Channel("noise", "length")}
+        return tuple((named[dimension],) for dimension in self.dimensions())
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Records of a body: commanded angles and approaches by joint (N each), poses (N x 4 x 4) and their noise (N)."""
+
+    angles: Mapping[str, Array]
+    poses: Array
+    noise: Array  # of the rotation about any axis (rad), or of each coordinate (m)
+    approaches: Mapping[str, Array] = field(default_factory=dict)
+    sweeps: Array | None = None  # the number of the sweep that each belongs to
+    place_noise: Array | None = None  # of each coordinate (m), where both are compared
+
+    def dataset(self, arm: str) -> Dataset:
+        count = len(self.poses)
+        channels = {f"{arm}.{joint}": angles for joint, angles in self.angles.items()}
+        channels |= {f"{arm}.approach.{joint}": approach for joint, approach in self.approaches.items()}
+        rotations = np.where(np.isnan(self.poses[:, :3, :3]), np.eye(3), self.poses[:, :3, :3])
+        quaternions = np.array([quaternion_of(rotation) for rotation in rotations])
+        channels |= {f"{BODY}.{axis}": self.poses[:, i, 3] for i, axis in enumerate("xyz")}
+        channels |= {f"{BODY}.{name}": quaternions[:, i] for i, name in enumerate(_QUATERNION)}
+        channels |= {f"{BODY}.sweep": np.zeros(count) if self.sweeps is None else self.sweeps}
+        noise = self.noise if self.place_noise is None else self.place_noise
+        channels |= {f"{BODY}.noise_rotation": self.noise, f"{BODY}.noise": noise}
+        return Dataset(tuple(str(i) for i in range(count)), channels)
+
+
+class BodyFit:
+    """Corrections of joints fitted to what was seen of a body; ``values`` are those of the last fit.
+
+    Args:
+        experiment: whose arm it is, at its parameters' nominal values.
+        corrections, body: what is added to it.
+        free: what may move, with the standard deviations about where it starts; None for no prior.
+        springs: whether the arm's springs give.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        arm: Arm,
+        corrections: Corrections,
+        body: Body,
+        free: Mapping[str, float | None],
+        seen: Seen,
+        *,
+        springs: bool = True,
+    ) -> None:
+        self._arm, environment = arm.name, experiment.system.environment
+        nominal = {block.name: ca.SX(list(block.nominal)) for block in arm.parameters()}
+        own = {n: e for n, e in arm.effects.items() if springs and e.springs(scoped(nominal, f"{arm.name}.{n}."))}
+        arm = replace(arm, effects={**own, TABLES: corrections}, residual=None)
+        blocks = [
+            *experiment.parameters.blocks,
+            *prefixed(f"{arm.name}.{TABLES}.", declared(corrections)),
+            *prefixed(f"{BODY}.", declared(body)),
+        ]
+        fixed = [replace(b, free=b.name in free, prior_sd=free.get(b.name), drift=None) for b in blocks]
+        parameters = Parameters(tuple(block for block in fixed if not block.nuisance))
+        dataset = seen.dataset(arm.name)
+        arms, measurements = {arm.name: arm}, {BODY: body}
+        self.problem = Problem.build(arms, measurements, parameters, environment, dataset, "interpreted")
+        self.values = parameters.nominal()
+
+    @property
+    def parameters(self) -> Parameters:
+        return self.problem.parameters
+
+    def fit(self, seen: Seen, weights: Array) -> None:
+        """To records like those that it was built with, from where the last fit ended.
+
+        Raises:
+            NotConvergedError: a record has no elastic equilibrium.
+        """
+        self.problem = self.problem.of(seen.dataset(self._arm), weights)
+        posed = PosedProblem(self.problem)
+        self.values = posed.values(descended(posed, posed.x(self.values), _MOST_STEPS, _DAMPING, _AT_REST))
+
+    def residuals(self, changes: Mapping[str, Any] | None = None) -> Array:
+        """Raw, of each record (rows x N), with other values of some numbers."""
+        values = self.values.copy()
+        for name, value in (changes or {}).items():
+            values[self.parameters.entries_of(name)] = value
+        return self.problem.residuals(values)[0]
+
+    @property
+    def noise_scale(self) -> float:
+        """Of the residuals, in units of the stated noise; one at least."""
+        freedom = max(self.problem.equations() - self.problem.increments, 1)
+        return max(1.0, float(np.sqrt(2 * self.problem.cost(self.values) / freedom)))
+
+    def value(self, name: str) -> float:
+        return float(self.values[self.parameters.entries_of(name)][0])
+
+    def move(self, name: str, value: float) -> None:
+        self.values[self.parameters.entries_of(name)] = value
+
+    def deviations(self, names: Sequence[str], rows: Array | None = None) -> Array:
+        """Standard deviations of some numbers, or of linear combinations of them (rows of M x names)."""
+        root = InverseInformation.of(self.problem.triangular_factor(self.values), self.parameters).root
+        chosen = root[[self.parameters.coordinates_of[name].start for name in names]]
+        return np.asarray(np.linalg.norm(chosen if rows is None else rows @ chosen, axis=1))
