@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from armcal.base.arrays import Array
+from armcal.base.settings import Duration
 from armcal.devices.live import TrackerFrame
 from armcal_simulation.bench.tracker import Fraction, TrackerModel, TrackerSettings
 from pydantic import Field, model_validator
@@ -20,11 +21,16 @@ Number = Annotated[int, Field(ge=0, le=999)]
 
 
 class DTrackSenderSettings(TrackerSettings):
-    """``bodies`` gives each body its number in the datagrams (from 0)."""
+    """``bodies`` gives each body its number in the datagrams (from 0).
+
+    The tracker's clock is ahead by ``clock_offset``, and gains ``clock_skew_ppm``.
+    """
 
     bodies: Annotated[dict[str, Number], Field(min_length=1, default_factory=lambda: {"base": 1, "tool": 2})]
     occluded: dict[str, Fraction] = Field(default_factory=dict)  # type: ignore[assignment]
     lines: Literal["6d", "6di"] = "6d"
+    clock_offset: Duration = 0.0
+    clock_skew_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
     first_frame: Annotated[int, Field(ge=0, lt=2**32)] = 1
 
     @model_validator(mode="after")
@@ -45,6 +51,7 @@ class DTrackSender:
         self._address = (host, port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._began: float | None = None
         self._under_way: deque[tuple[float, bytes]] = deque()
 
     def send(self, now: float, frame: TrackerFrame | None) -> None:
@@ -54,10 +61,13 @@ class DTrackSender:
             now: the bench's wall clock (unix s).
             frame: None: none is sent.
         """
+        self._began = now if self._began is None else self._began
         if frame is not None:
+            gained = 1e-6 * self._settings.clock_skew_ppm * (frame.arrived - self._began)
+            stamp = frame.arrived + self._settings.clock_offset + gained
             counter = (frame.counter + self._settings.first_frame - 1) % 2**32
             poses = {self._settings.bodies[name]: pose for name, pose in frame.bodies.items()}
-            text = datagram(counter, frame.stamp, poses, self._settings.lines)
+            text = datagram(counter, stamp, poses, self._settings.lines)
             self._under_way.append((now + self._settings.latency, text))
         while self._under_way and self._under_way[0][0] <= now:
             with contextlib.suppress(OSError):  # nobody has to listen

@@ -21,7 +21,6 @@ class FaultRequest(Settings):
     angle: float = 0.0  # ``put``: where somebody moves the joint by hand (rad); one that holds stays
     body: str | None = None  # ``lost`` and ``seen``: which; all by default
     counter: Literal["rising", "same"] = "rising"  # ``frozen``: what the frame counter does
-    ppm: float = 0.0  # ``skew``: how much the tracker's clock gains
 
 
 class FaultCalendar:

@@ -23,8 +23,8 @@ class TrackerSettings(Settings):
     ``noise`` is the standard deviation of each coordinate, ``orientation_noise`` of the turn about each axis of a body.
     The bodies are ``tool`` and ``base``. A body is ``occluded`` for a fraction of the time, for ``occlusion`` on
     average each time. ``lost_frames`` is the fraction of frames that never arrive. A frame arrives ``latency`` after
-    its moment. The tracker's clock is ahead by ``clock_offset``, and gains ``clock_skew_ppm``. A tracker that was set
-    up wrong gives positions ``length_gain`` times too large, or in a left-handed frame: with its axis ``mirrored``.
+    its moment. A tracker that was set up wrong gives positions ``length_gain`` times too large, or in a left-handed
+    frame: with its axis ``mirrored``.
     """
 
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 60.0
@@ -34,8 +34,6 @@ class TrackerSettings(Settings):
     occlusion: Annotated[Duration, Field(gt=0)] = 0.2
     lost_frames: Fraction = 0.0
     latency: Annotated[Duration, Field(ge=0)] = 0.0
-    clock_offset: Duration = 0.0
-    clock_skew_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
     length_gain: Annotated[float, Field(gt=0)] = 1.0
     mirrored: Literal["none", "x", "y", "z"] = "none"
 
@@ -51,7 +49,6 @@ class TrackerFaults:
     hidden: set[str] = field(default_factory=set)  # bodies that it cannot see
     silent: bool = False  # it sends nothing, while its frame counter goes on
     frozen: Literal["no", "rising", "same"] = "no"
-    skew_ppm: float = 0.0  # how much its clock gains on top of the settings
 
 
 class TrackerModel:
@@ -61,7 +58,6 @@ class TrackerModel:
         self.faults, self.counter = TrackerFaults(), 1
         self._settings, self._bodies, self._random = settings, tuple(bodies), random
         self._last: float | None = None
-        self._ahead = settings.clock_offset
         self._occluded: set[str] = set()
         self._shown: TrackerFrame | None = None
 
@@ -74,14 +70,13 @@ class TrackerModel:
         """
         elapsed = 0.0 if self._last is None else now - self._last
         self._last = now
-        self._ahead += elapsed * 1e-6 * (self._settings.clock_skew_ppm + self.faults.skew_ppm)
         poses = self._seen(bodies, elapsed)
         is_lost = self._random.random() < self._settings.lost_frames
         if self.faults.frozen == "no" or self._shown is None:
-            self._shown = TrackerFrame(self.counter, now, now + self._ahead, poses)
+            self._shown = TrackerFrame(self.counter, now, None, poses)
         shown = self._shown
         if self.faults.frozen == "rising":
-            shown = replace(shown, counter=self.counter, stamp=now + self._ahead)
+            shown = replace(shown, counter=self.counter, arrived=now)
         self.counter += 1
         return None if is_lost or self.faults.silent else shown
 

@@ -52,7 +52,7 @@ class BenchWorld:
         bodies: that the tracker sees, in an order.
     """
 
-    kinds: ClassVar[tuple[str, ...]] = ("lost", "silent", "frozen", "skew", "seen")  # of faults
+    kinds: ClassVar[tuple[str, ...]] = ("lost", "silent", "frozen", "seen")  # of faults
     requests: ClassVar[type[FaultRequest]] = FaultRequest
 
     def __init__(
@@ -125,10 +125,8 @@ class BenchWorld:
             tracker.silent = True
         elif fault.kind == "frozen":
             tracker.frozen = fault.counter
-        elif fault.kind == "skew":
-            tracker.skew_ppm = fault.ppm
         elif fault.kind == "seen":
-            tracker.silent, tracker.frozen, tracker.skew_ppm = False, "no", 0.0
+            tracker.silent, tracker.frozen = False, "no"
             tracker.hidden -= bodies
 
     def _track(self, now: float, base_T_body: Array | None) -> None:
