@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 from armcal.devices.clock import RealClock
-from armcal_simulation.bench.dtrack_sender import datagram
 from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
 
 from benchmarks.report import Row
 from benchmarks.timing import best_times
+from tests.simulated_lines.dtrack_sender import datagram
 
 NAME = "tracker"
 FRAMES = 5000

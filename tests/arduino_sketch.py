@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from armcal_simulation.boards.pca9685_model import BusStuckError, I2cBus
+from tests.simulated_lines.pca9685_model import BusStuckError, I2cBus
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "arduino.md"
 STAND_IN = r"""

@@ -7,7 +7,7 @@ import shutil
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,22 +15,43 @@ from typing import Any
 
 import numpy as np
 from armcal.base.dataset import Dataset
-from armcal.cli.main import cli
-from armcal.devices.clock import SimulatedClock
-from armcal.devices.simulated import CLOCK, BenchRequest
+from armcal.config.system import build_component
 from armcal.errors import ArmcalError, InputError
 from armcal.io.journal import KeptJournal, has_journal
+from armcal.plugins import use_plugins
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.rehearsal import overrides_for
 from armcal_bench.acquisition.run_log import Progress, dataset_of, progress_of
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
-from armcal_bench.bench import Bench
+
+from tests.simulated_lines.line_world import BOARD, CLOCK
+from tests.simulated_lines.socket_clock import SimulatedClock
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "configs" / "lrm_arm" / "bench.yaml"
 POSES = ((0, 0, 0, 0, 0, 0), (40, -30, 60, -50, 30, 20), (-60, 20, 90, 40, -40, -30), (20, 40, -50, 80, 60, 10))
 """Degrees."""
+AT_LINE = ROOT / "tests" / "simulated_lines" / "at_line.py"
+_IDS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")  # of the SO-101, from 1 on
+
+
+def overrides_for(folder: Path, part: str = "link") -> tuple[str, ...]:
+    """What makes a configuration meet the bench that is served at a line in a folder.
+
+    ``part``: of the bench, which has the serial port: a ``link`` to boards, or a ``device`` with a bus.
+    """
+    use_plugins(AT_LINE)
+    there, kind = folder.absolute(), "servo" if part == "link" else "bus"
+    return (
+        f"bench.simulated={there}",
+        f"bench.{part}.port={there / BOARD}",
+        f"bench.simulator.type={kind}_bench_at_line",
+    )
+
+
+def bus_ids() -> tuple[str, ...]:
+    """What the SO-101's bench at a line needs beside that of this process: which servo has which id."""
+    return tuple(f"bench.simulator.joints.{joint}.id={number}" for number, joint in enumerate(_IDS, start=1))
 
 
 def free_port() -> int:
@@ -70,6 +91,8 @@ class BenchRun:
         ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
         if self.config == CONFIG:  # it holds the arm at the end; these runs see the servos let go unless they say so
             ports = (*ports, "bench.acquisition.at_end=release")
+        if self.part == "device":
+            ports = (*ports, *bus_ids())
         self.experiment = Experiment.load(self.config, (*ports, *self.sets, *overrides_for(self.bench, self.part)))
         self.plan = write_plan(self.folder / "plan.csv")
 
@@ -92,7 +115,7 @@ class BenchRun:
         """The bench, forked off; the clock is one more client of it."""
         child = os.fork()
         if child == 0:
-            _in_child(lambda: Bench.of(self.experiment).simulator().serve(BenchRequest(self.experiment, self.bench)))
+            _in_child(lambda: serve(self.experiment, self.bench))
         try:
             clock = _connected(self.bench)
             try:
@@ -155,12 +178,22 @@ def positions(dataset: Dataset) -> dict[str, np.ndarray]:
     return dict(zip(dataset.ids, xyz, strict=True))
 
 
+def serve(experiment: Experiment, folder: Path) -> None:
+    """The bench of a configuration, at a line in a folder, until its end."""
+    build_component(experiment.source, experiment.registry, "bench", ("bench", "simulator"))[0].serve(
+        experiment, folder
+    )
+
+
 @contextmanager
-def bench_served_by_the_command(config: Path, folder: Path) -> Iterator[None]:
-    """``armcal simulated-bench`` in a child, once it is ready."""
+def simulated_bench(config: Path, overrides: Sequence[str], folder: Path, part: str = "link") -> Iterator[None]:
+    """A bench at a line in a folder, forked off."""
+    folder.mkdir(parents=True, exist_ok=True)
+    ids = bus_ids() if part == "device" else ()
+    experiment = Experiment.load(config, (*ids, *overrides, *overrides_for(folder, part)))
     child = os.fork()
     if child == 0:
-        _in_child(lambda: cli(["simulated-bench", str(config), "--dir", str(folder)], standalone_mode=False))
+        _in_child(lambda: serve(experiment, folder))
     try:
         _connected(folder).close()
         yield

@@ -13,8 +13,9 @@ import numpy as np
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, servo_file_text
 from armcal.devices.device import DeviceError
 from armcal.devices.link import LinkIdentity
-from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
-from armcal_simulation.boards.pca9685_model import I2cBus, Pca9685Model
+
+from tests.simulated_lines.framed_board import BoardIdentity, FramedBoard
+from tests.simulated_lines.pca9685_model import I2cBus, Pca9685Model
 
 LRM_PULSES_US = {
     "q1": (620, 1540, 2460),

@@ -15,7 +15,6 @@ import os
 import re
 import shlex
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -27,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.recordings import free_port, postures, still_lines
+from tests.recordings import postures, still_lines
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "data"
@@ -50,7 +49,6 @@ class Place:
         return self.root / "runs" / self.name
 
     def filled(self, text: str) -> str:
-        text = text.replace("{port}", str(free_port()))
         return text.replace("{out}", f"runs/{self.name}").replace("{shared}", str(SHARED))
 
     def armcal(self, line: str, given: str = "", until: Callable[[], bool] | None = None) -> None:
@@ -196,36 +194,13 @@ def typed(line: str, given: str) -> Step:
     return command
 
 
-def on_bench(config: str, *lines: str, kill_first_at: float = math.inf, given: str = "") -> Step:
-    """Commands beside a simulated bench; the first may be killed (SIGKILL) once so many simulated seconds passed."""
+def killed_on_bench(line: str) -> Step:
+    """A rehearsal that is killed (SIGKILL) once its simulated bench has kept its state, ten seconds on."""
 
-    def commands(place: Place) -> None:
-        clock, port = place.out / "bench" / "clock", free_port()
-        ports = f"--set bench.tracker.port={port} --set bench.simulator.tracker.port={port}"
-        there = place.filled(
-            f"{ports} --set bench.clock.simulated={{out}}/bench/clock --set bench.link.port={{out}}/bench/board"
-        )
-        words = shlex.split(place.filled(f"simulated-bench {config} --dir {{out}}/bench {ports}"))
-        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        served = subprocess.Popen([sys.executable, "-m", "armcal.cli", *words], cwd=place.root, **silent)
-        try:
-            while not clock.exists() and served.poll() is None:
-                time.sleep(0.05)
-            for i, line in enumerate(lines):
-                due = (lambda: _now(clock) > kill_first_at) if i == 0 and math.isfinite(kill_first_at) else None
-                place.armcal(f"{line} {there}", given, due)
-        finally:
-            served.terminate()
-            served.wait(30)
+    def command(place: Place) -> None:
+        place.armcal(line, until=(place.out / "acquired" / "bench" / "truth.json").exists)
 
-    return commands
-
-
-def _now(clock: Path) -> float:
-    with socket.socket(socket.AF_UNIX) as link:
-        link.connect(os.path.relpath(clock))
-        link.sendall(b'{"state": true}\n')
-        return float(json.loads(link.makefile().readline())["now"])
+    return command
 
 
 def none_lost(place: Place) -> None:
@@ -415,7 +390,6 @@ LOG = (
 BENCH = "configs/lrm_arm/bench.yaml"
 QUICK = "--set bench.acquisition.period_s=0.04"
 LEVELS = "--set 'plan.levels.q1=[0 deg]' --set plan.sweeps=10"
-PORT = "--set bench.tracker.port={port} --set bench.simulator.tracker.port={port}"
 KEPT = "recalibrate runs/lrm-demo/calibration.yaml --from {out}/poses.csv --config {out}/online.yaml --out {out}/kept"
 PLUGINS = "--plugin {out}/gear_wave.py --plugin {out}/total_station.py"
 MINE = "runs/plugin/runs/experiment/calibration.yaml"
@@ -621,19 +595,15 @@ ENTRIES: tuple[Entry, ...] = (
         "a measuring run rehearsed",
         text("small.csv", SMALL),
         f"acquire {BENCH} --plan {{out}}/small.csv --dry-run --json",
-        f"rehearse {BENCH} --plan {{out}}/small.csv --out {{out}}/rehearsed --json {QUICK} {PORT}",
+        f"rehearse {BENCH} --plan {{out}}/small.csv --out {{out}}/rehearsed --json {QUICK}",
         reads=["0.out", "rehearsed/summary.json", "rehearsed/dataset.csv"],
     ),
     entry(
         "acquired-killed",
-        "the same acquired on a simulated bench, killed and resumed",
+        "the same, killed and resumed",
         text("small.csv", SMALL),
-        on_bench(
-            BENCH,
-            f"acquire {BENCH} --plan {{out}}/small.csv --out {{out}}/acquired --yes --unchecked {QUICK}",
-            f"acquire {BENCH} --plan {{out}}/small.csv --out {{out}}/acquired --yes --unchecked --resume {QUICK}",
-            kill_first_at=14.0,
-        ),
+        killed_on_bench(f"rehearse {BENCH} --plan {{out}}/small.csv --out {{out}}/acquired {QUICK}"),
+        f"rehearse {BENCH} --plan {{out}}/small.csv --out {{out}}/acquired --resume {QUICK}",
         none_lost,
         reads=["lost.json", "acquired/summary.json"],
         needs=["rehearsed"],
@@ -649,16 +619,15 @@ ENTRIES: tuple[Entry, ...] = (
     entry(
         "servo-tracked",
         "servo tables found with a tracker, default settings",
-        on_bench(BENCH, f"servo {BENCH} --out {{out}}/servo --yes --keep --json"),
+        f"rehearse {BENCH} --servo tracked --out {{out}}/servo",
         reads=["servo/servo.json"],
     ),
     entry(
         "servo-guided",
         "servo tables of two joints, set by eye",
-        on_bench(
-            BENCH,
-            f"servo {BENCH} --guided --out {{out}}/servo --yes --keep --json --set 'bench.servo.joints=[q1, q3]'",
-            given="+10\n-3\nok\n" * 20,
+        typed(
+            f"rehearse {BENCH} --servo guided --out {{out}}/servo --set 'bench.servo.joints=[q1, q3]'",
+            "+10\n-3\nok\n" * 20,
         ),
         reads=["servo/servo.json"],
     ),

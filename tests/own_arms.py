@@ -11,10 +11,9 @@ from typing import Any
 
 import yaml
 from armcal.cli.main import cli
-from armcal_bench.acquisition.rehearsal import overrides_for
 from click.testing import CliRunner, Result
 
-from tests.bench_runs import BenchRun
+from tests.bench_runs import BenchRun, overrides_for
 
 TOWER_SERVOS = """\
 # tower: the two strong ones turn 270 degrees (data sheet: 500 to 2500 us)
@@ -94,7 +93,7 @@ class OwnArm:
 
     def armcal(self, command: str, *words: str | Path, sets: tuple[str, ...] = (), **more: Any) -> Result:
         """A command as a user gives it; all but a rehearsal meet the bench that is there."""
-        ports = [f"bench.{part}.port={self._port}" for part in ("tracker", "simulator.tracker")]
+        ports = [f"bench.tracker.port={self._port}"]
         there = overrides_for(self.run.bench) if command != "rehearse" else ()
         given = [word for text in (*self.run.sets, *ports, *there, *sets) for word in ("--set", text)]
         return CliRunner().invoke(cli, [command, str(self.run.config), *map(str, words), *given], **more)
@@ -127,8 +126,7 @@ def _config(kind: dict[str, Any]) -> dict[str, Any]:
     }
     limits = {joint: [f"{-size} deg", f"{size} deg"] for joint, size in kind["limits"].items()}
     base = {joint: f"{angle} deg" for joint, angle in kind["base"].items()}
-    tracker = {"port": 15000, "bodies": {"base": 1, "tool": 2}, "rate_hz": 15.0}
-    servo_bench = {"type": "servo_bench", "board_id": kind["id"], "servos": "true.yaml", "tracker": tracker, "seed": 3}
+    servo_bench = {"type": "servo_bench", "servos": "true.yaml", "tracker": {"rate_hz": 15.0}, "seed": 3}
     return {
         "name": kind["id"].lower(),
         "arms": {

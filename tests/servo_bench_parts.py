@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from armcal_simulation.bench.serial_line import SerialLine, delimited
-from armcal_simulation.boards.framed_board import FramedBoard
-from armcal_simulation.boards.pca9685_model import I2cBus, Pca9685Model
 
 from tests.arduino_sketch import SketchBoard
+from tests.simulated_lines.framed_board import FramedBoard
+from tests.simulated_lines.pca9685_model import I2cBus, Pca9685Model
+from tests.simulated_lines.serial_line import SerialLine, delimited
 
 ADDRESS = 0x40
 TICK = 122 / 25e6

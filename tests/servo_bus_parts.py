@@ -5,10 +5,11 @@ from __future__ import annotations
 import termios
 
 import numpy as np
-from armcal_simulation.bus.motor import BusMotor, BusMotorSettings
-from armcal_simulation.bus.registers import TABLES
-from armcal_simulation.bus.servo import BusServo
-from armcal_simulation.bus.servo_bus import ServoBus
+
+from tests.simulated_lines.bus_motor import BusMotor, BusMotorSettings
+from tests.simulated_lines.bus_registers import TABLES
+from tests.simulated_lines.bus_servo import BusServo
+from tests.simulated_lines.servo_bus import ServoBus
 
 BAUD = 1_000_000
 

@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.devices.clock import SimulatedClock
 from armcal.io.journal import JOURNAL, Journal
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.rehearsal import overrides_for
 from armcal_bench.servo.record import Record
 from armcal_bench.servo.session import evaluated, measure
 from armcal_bench.servo.setup import Conversation, Setup
 
-from tests.bench_runs import BenchRun, _in_child, _wait, free_port
+from tests.bench_runs import BenchRun, _in_child, _wait, free_port, overrides_for
 from tests.servo_fakes import CONFIGS
+from tests.simulated_lines.socket_clock import SimulatedClock
 
 JOINTS = ("q3", "q5")
 SETS = (

@@ -11,7 +11,7 @@ from forked import run_code
 
 CONFIG = Path(__file__).parents[1] / "configs" / "lrm_arm" / "demo.yaml"
 APPLICATIONS = {
-    "bench": {"acquire", "record", "rehearse", "servo", "simulated-bench"},
+    "bench": {"acquire", "record", "rehearse", "servo"},
     "camera": {"board"},
     "capability": {"acceptance", "capability"},
     "lerobot": {"lerobot"},

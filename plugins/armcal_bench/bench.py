@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
@@ -12,10 +13,11 @@ from armcal.base.poses import PoseSettings
 from armcal.base.settings import InputPath, Settings
 from armcal.config.system import build_component
 from armcal.config.validate import validate
-from armcal.devices.clock import Clock, RealClock, SimulatedClock
+from armcal.devices.clock import Clock, RealClock
 from armcal.devices.device import JointDevice
+from armcal.devices.link import GuardedLink
 from armcal.devices.live import JointStream, LiveCamera, Tracker, TrackerFrame
-from armcal.devices.simulated import SimulatedBench
+from armcal.devices.simulated import BenchRequest, RunningBench, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.measure.rests import far_off, mean_rotation
 from armcal.plugins import refuse
@@ -163,20 +165,14 @@ def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
 SECTION = "bench"
 
 
-class SimulatedClockSettings(Settings):
-    """The clock of a simulated bench: the path of its socket."""
-
-    simulated: InputPath
-
-
 class BenchSettings(Settings):
     """Components keep their own settings under ``type``.
 
-    ``bodies`` says which of the tracker's bodies is what. ``clock`` is the machine's, unless a simulated bench is at
-    the other end.
+    ``bodies`` says which of the tracker's bodies is what. ``simulated`` is the folder of a simulated bench (that of
+    ``simulator``) that stands in for device, tracker and joint readings; without it they are the real ones.
     """
 
-    clock: Literal["real"] | SimulatedClockSettings = "real"
+    simulated: InputPath | None = None
     link: dict[str, Any] | None = None
     device: dict[str, Any] | None = None
     tracker: dict[str, Any] | None = None
@@ -242,24 +238,31 @@ class Bench:
         where, hint = self.experiment.source.where(("arms",)), "Configure each arm's bench on its own."
         return only_arm(self.experiment.system.arms, "a bench moves a single arm", hint, where)
 
-    @contextmanager
-    def clock(self) -> Iterator[Clock]:
-        """The machine's clock, or the simulated bench's.
+    @cached_property
+    def simulation(self) -> RunningBench | None:
+        """The simulated bench that stands in for the parts; None where they are real.
 
         Raises:
-            InputError: no simulated bench answers.
+            ConfigError: refused, or none is configured.
+            InputError: its folder cannot be used.
         """
-        if not isinstance(self.settings.clock, SimulatedClockSettings):
+        if self.settings.simulated is None:
+            return None
+        simulator: SimulatedBench = self._built("simulator", kind="bench")
+        bodies = self.settings.bodies
+        return simulator.start(BenchRequest(self.experiment, self.settings.simulated, bodies.tool, bodies.base))
+
+    @contextmanager
+    def clock(self) -> Iterator[Clock]:
+        """The machine's clock, or the simulated bench's, which ends with it."""
+        if self.simulation is None:
             yield RealClock()
             return
-        clock = SimulatedClock(self.settings.clock.simulated)
-        try:
-            yield clock
-        finally:
-            clock.close()
+        with closing(self.simulation):
+            yield self.simulation.clock
 
     def device(self) -> JointDevice:
-        """The device, on its link if one is configured.
+        """The device, on its link if one is configured, or what stands in for it.
 
         Raises:
             ConfigError: refused, or none is configured.
@@ -269,25 +272,20 @@ class Bench:
         built: JointDevice = self._built("device", joints, link)
         if built.joint_names != joints:
             refuse(type(built), f"{built.joint_names} as joint_names", f"{joints}, as it was given them")
-        return built
+        return built if self.simulation is None else self.simulation.device(built, isinstance(link, GuardedLink))
 
     def tracker(self) -> Tracker:
         """The tracker; see ``device``."""
         built: Tracker = self._built("tracker")
-        return built
+        return built if self.simulation is None else self.simulation.tracker(built)
 
     def joints(self) -> JointStream:
         """The stream of joint readings; see ``device``."""
         built: JointStream = self._built("joints")
-        return built
+        return built if self.simulation is None else self.simulation.joints(built)
 
     def camera(self) -> LiveCamera | None:
         return None if self.settings.camera is None else self._built("camera")
-
-    def simulator(self) -> SimulatedBench:
-        """The simulated bench; see ``device``."""
-        built: SimulatedBench = self._built("simulator", kind="bench")
-        return built
 
     def _built(self, part: str, *context: Any, kind: str = "") -> Any:
         at = (SECTION, part)

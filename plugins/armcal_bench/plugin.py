@@ -11,7 +11,11 @@ def armcal_register_commands(register: Register) -> None:
         "armcal_bench.commands.acquire:acquire_command",
         "Drive a plan with servo board and tracker, and measure it.",
     )
-    register("rehearse", "armcal_bench.commands.rehearse:rehearse", "Do what acquire does, against a simulated bench.")
+    register(
+        "rehearse",
+        "armcal_bench.commands.rehearse:rehearse",
+        "Do what acquire or servo does, against a simulated bench.",
+    )
     register(
         "record",
         "armcal_bench.commands.record:record_command",
@@ -21,9 +25,4 @@ def armcal_register_commands(register: Register) -> None:
         "servo",
         "armcal_bench.commands.servo:servo",
         "Which pulse makes which angle: servo tables, by tracker or by eye.",
-    )
-    register(
-        "simulated-bench",
-        "armcal_bench.commands.rehearse:simulated_bench_command",
-        "Stand in for a servo board, arm and tracker.",
     )

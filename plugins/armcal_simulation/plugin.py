@@ -13,5 +13,4 @@ def armcal_register_simulators(register: Register) -> None:
 
 @hookimpl
 def armcal_register_benches(register: Register) -> None:
-    register("servo_bench", f"{_HERE}.boards.servo_bench:ServoBench", "a servo board at a pty, an arm, a tracker")
-    register("bus_bench", f"{_HERE}.bus.bus_bench:BusBench", "smart servos on a bus at a pty, an arm, a tracker")
+    register("servo_bench", f"{_HERE}.bench.servo_bench:ServoBench", "a board, an arm of servos and a tracker")

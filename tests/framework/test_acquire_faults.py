@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from armcal.devices.clock import SimulatedClock
 from armcal.devices.device import DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.io.journal import Journal, KeptJournal, has_journal
 
 from tests.bench_runs import BenchRun, positions
+from tests.simulated_lines.socket_clock import SimulatedClock
 
 MANY = 200
 SECONDS = 28.0

@@ -17,7 +17,6 @@ import pytest
 from armcal.arm.clearance import Checked
 from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
-from armcal.devices.clock import SimulatedClock
 from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.errors import ArmcalError, InputError
 from armcal.io.journal import Journal, JournalFailedError, JournalFullError
@@ -37,6 +36,7 @@ from scipy.spatial.transform import Rotation
 from tests.bench_fakes import COUNT_RAD
 from tests.bench_runs import CONFIG, POSES, BenchRun, positions, write_plan
 from tests.framework.test_acquisition import Run, torques
+from tests.simulated_lines.socket_clock import SimulatedClock
 
 SETS = ("bench.acquisition.lost.park_s=6", "bench.acquisition.period_s=0.04")
 AGREE_M = 0.0015

@@ -1,4 +1,4 @@
-"""From an uncalibrated bench to a predicted tip, by a user's commands; nothing is mocked above pty and socket."""
+"""From an uncalibrated bench to a predicted tip, by commands, through pyserial, a pty, framed bytes and datagrams."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ from armcal.config.servo_file import load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.rehearsal import overrides_for, simulated_bench
 
-from tests.bench_runs import free_port, write_plan
+from tests.bench_runs import free_port, overrides_for, simulated_bench, write_plan
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 POSES, FRESH = 60, 16

@@ -1,4 +1,4 @@
-"""What the pages on the bench show for two terminals, as printed, in a folder that holds nothing but ``configs``."""
+"""What the page on servos shows of a rehearsal, as printed, in a folder that holds nothing but ``configs``."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import yaml
 
-from tests.bench_runs import free_port
 from tests.docs_commands import blocks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,10 +20,8 @@ ARMCAL = [sys.executable, "-m", "armcal.cli"]
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A fresh one; the tracker's port is a free one, for other tests have benches as well."""
+    """A fresh one."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    bench, port = tmp_path / "configs" / "lrm_arm" / "bench.yaml", free_port()
-    bench.write_text(bench.read_text().replace("port: 15000", f"port: {port}"))
     return tmp_path
 
 
@@ -39,20 +34,8 @@ def shown(page: str, *commands: str) -> list[list[str]]:
     raise AssertionError(f"{page} shows no {commands}")
 
 
-@contextmanager
-def served(words: list[str], folder: Path) -> Iterator[None]:
-    """The first terminal."""
-    bench = subprocess.Popen([*ARMCAL, *words], cwd=folder, stdout=subprocess.PIPE, text=True)
-    try:
-        assert bench.stdout is not None and "clock" in bench.stdout.readline()
-        yield
-    finally:
-        bench.terminate()
-        bench.wait(60)
-
-
 def given(words: list[str], folder: Path) -> str:
-    """The second terminal: what it said, once it ended well."""
+    """What a command said, once it ended well."""
     done = subprocess.run([*ARMCAL, *words], cwd=folder, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
@@ -60,10 +43,9 @@ def given(words: list[str], folder: Path) -> str:
 
 @pytest.mark.slow
 def test_the_page_on_servos_calibrates_those_of_the_sound_bench(folder: Path) -> None:
-    first, second = shown("servo.md", "simulated-bench", "servo")
-    with served(first, folder):
-        said = given(second, folder)
-    assert "times those of the model" not in said
+    (command,) = shown("servo.md", "rehearse")
+    said = given(command, folder)
+    assert "times those of the model" not in said and "unsafe was: nothing" in said
     found = yaml.safe_load((folder / "runs" / "servo" / "servo.json").read_text())["servos"]
     truth = yaml.safe_load((folder / "configs" / "lrm_arm" / "bench_servos.yaml").read_text())
     longer = truth["boards"]["front"]["oscillator_hz"] / 25e6
@@ -76,9 +58,8 @@ def test_the_page_on_servos_calibrates_those_of_the_sound_bench(folder: Path) ->
 @pytest.mark.slow
 def test_the_base_pose_on_the_page_on_servos_checks_all_joints_and_lets_them_cool(folder: Path) -> None:
     base = re.search(r"\n    base: (\{.*\})\n", (ROOT / "docs" / "servo.md").read_text(encoding="utf-8"))
-    first, second = shown("servo.md", "simulated-bench", "servo")
-    sets = [*second[second.index("--set") :], "--set", f"bench.servo.base={base and base[1]}"]
-    with served(first, folder):
-        said = given(["servo", second[1], "--check", "--yes", *sets], folder)
-        assert said.count(" turned by ") == 6 and "other way" not in said and "cannot be" not in said
-        given([*second, *sets[-2:], "--set", "bench.servo.step=46 deg"], folder)
+    (command,) = shown("servo.md", "rehearse")
+    sets = ["--set", f"bench.servo.base={base and base[1]}"]
+    said = given([*command[:2], "--servo", "check", "--out", "runs/check", *sets], folder)
+    assert said.count(" turned by ") == 6 and "other way" not in said and "cannot be" not in said
+    given([*command, *sets, "--set", "bench.servo.step=46 deg"], folder)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal_bench.acquisition.rehearsal import overrides_for
 from armcal_bench.joint_check import JointCheck, Zero
-from bench_runs import BenchRun
 from click.testing import CliRunner
+
+from tests.bench_runs import BenchRun, overrides_for
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "so101"
 SERVO = "bench.simulator.joints."
@@ -54,7 +54,7 @@ def test_joints_that_turn_as_commanded_are_right_and_only_those_are_driven(tmp_p
     changed = "bench.device.joints.elbow_flex.direction=-1", "bench.device.joints.wrist_roll.id=7"
     assert "(elbow_flex, wrist_roll: changed since it was checked)" in unchecked(tmp_path, *changed)
     assert "wrist_flex: changed" in unchecked(tmp_path, "bench.device.joints.wrist_flex.range_deg=[-95, 96]")
-    real = unchecked(tmp_path, "bench.clock=real")
+    real = unchecked(tmp_path, "bench.simulated=null")
     assert "(shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, wrist_roll: changed" in real, "it was a simulated one"
 
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from armcal.devices.clock import SimulatedClock
 from armcal_bench.acquisition.tracker_monitor import Waits
 from armcal_bench.servo.record import Record
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm, said_by
+from tests.simulated_lines.socket_clock import SimulatedClock
 
 FEW = ("bench.servo.joints=[c]", "bench.servo.step_deg=80")
 """A calibration of a few poses."""

@@ -15,10 +15,11 @@ import pytest
 import yaml
 from armcal.cli.main import cli
 from armcal.errors import DataError
+from armcal.plugins import use_plugins
 from armcal_bench.servo.record import Record
 from click.testing import CliRunner
 
-from tests.bench_runs import bench_served_by_the_command, free_port
+from tests.bench_runs import AT_LINE, free_port, simulated_bench
 from tests.servo_fakes import config_in
 
 pytestmark = pytest.mark.slow
@@ -55,13 +56,14 @@ def bench(tmp_path_factory):
     config = config_in(
         folder,
         "bench:\n"
-        "  clock: {simulated: run/clock}\n"
+        "  simulated: run\n"
         "  link: {type: framed, port: run/board}\n"
         f"  tracker: {{port: {port}}}\n"
-        f"  simulator: {{tracker: {{port: {port}}}}}\n"
+        f"  simulator: {{type: servo_bench_at_line, tracker: {{port: {port}}}}}\n"
         f"  servo: {{joints: [{', '.join(JOINTS)}], step: 46 deg, period_s: 0.04}}\n",
     )
-    with bench_served_by_the_command(config, folder / "run"):
+    use_plugins(AT_LINE)
+    with simulated_bench(config, (), folder / "run"):
         yield config
 
 

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import REPEATED, TrackerFrame
-from armcal_simulation.bench.dtrack_sender import DTrackSender, DTrackSenderSettings, angles_deg, datagram
 from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
+
+from tests.simulated_lines.dtrack_sender import DTrackSenderSettings, SimulatedDTrack, angles_deg, datagram
 
 MIDNIGHT = 1_699_999_200.0 - 1_699_999_200.0 % 86400
 
@@ -49,9 +50,9 @@ class Listener:
             self.sender.sendto(each, self.tracker.address)
         return self.tracker.frames()
 
-    def simulated(self, seed: int = 1, **settings: object) -> DTrackSender:
+    def simulated(self, seed: int = 1, **settings: object) -> SimulatedDTrack:
         host, port = self.tracker.address
-        return DTrackSender(DTrackSenderSettings.si(**settings), host, port, seed)
+        return SimulatedDTrack(DTrackSenderSettings.si(**settings), host, port, seed)
 
 
 @pytest.fixture
@@ -159,7 +160,7 @@ def test_bad_settings(settings: dict[str, object]) -> None:
         DTrackSettings.model_validate(settings)
 
 
-def sent(listener: Listener, sender: DTrackSender, count: int, begin: float = 0.0) -> list[TrackerFrame]:
+def sent(listener: Listener, sender: SimulatedDTrack, count: int, begin: float = 0.0) -> list[TrackerFrame]:
     found = []
     for i in range(count):
         sender.send(MIDNIGHT + begin + i / 60, {"base": np.eye(4), "tool": np.eye(4)})
@@ -232,7 +233,7 @@ def test_the_same_seed_sends_the_same_bytes() -> None:
         runs = []
         for _ in range(2):
             settings = DTrackSenderSettings.si(occluded={"tool": 0.2}, lost_frames=0.1, clock_skew_ppm=50.0)
-            sender = DTrackSender(settings, *ear.getsockname(), seed=7)
+            sender = SimulatedDTrack(settings, *ear.getsockname(), seed=7)
             data = []
             for i in range(100):
                 sender.send(MIDNIGHT + i / 60, {"base": np.eye(4), "tool": np.eye(4)})

@@ -12,8 +12,9 @@ from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.link import GuardedLink
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.framed_link import FramedLink
-from armcal_simulation.boards.pca9685_model import ADDRESS_ONLY
 from board_bench import JOINTS, PtyBoard, servo_file, written
+
+from tests.simulated_lines.pca9685_model import ADDRESS_ONLY
 
 
 @pytest.fixture
@@ -248,7 +249,7 @@ def test_a_killed_hosts_half_frame_harms_nobody(board):
 
 
 def test_another_version_of_the_protocol_is_refused(board, monkeypatch):
-    monkeypatch.setattr("armcal_simulation.boards.framed_board.VERSION", 2)
+    monkeypatch.setattr("tests.simulated_lines.framed_board.VERSION", 2)
     with pytest.raises(DeviceRefusedError, match="version 2"):
         link_to(board).open(board.clock)
 

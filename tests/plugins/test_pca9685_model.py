@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from armcal_simulation.boards.pca9685_model import ADDRESS_ONLY, BusStuckError, I2cBus, Pca9685Model
 from hypothesis import given
 from hypothesis import strategies as st
+
+from tests.simulated_lines.pca9685_model import ADDRESS_ONLY, BusStuckError, I2cBus, Pca9685Model
 
 A = 0x40
 TICK = 122 / 25e6  # prescale 121

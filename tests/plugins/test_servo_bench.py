@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,17 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock
-from armcal.cli.main import cli
 from armcal.config.servo_file import load_servo_file
 from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
-from armcal.devices.simulated import BenchRequest
+from armcal.errors import ArmcalError
 from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment, clearance_check
-from armcal_simulation.bench.parts import ServoBenchSettings
-from armcal_simulation.bench.world import BenchWorld
-from armcal_simulation.boards.servo_bench import PulseBench, ServoBench
-from click.testing import CliRunner
 from servo_bench_parts import ADDRESS, read_all
+
+from tests.bench_runs import overrides_for, serve
+from tests.simulated_lines.line_world import LineWorld
+from tests.simulated_lines.servo_bench import PulseBench, ServoBenchAtLine, ServoBenchSettings
 
 LRM = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 JOINTS = tuple(f"q{j}" for j in range(1, 7))
@@ -64,7 +60,7 @@ def heard(ear: socket.socket) -> list[str]:
 class Host:
     """A host of a bench in this process: raw frames, counts, time."""
 
-    def __init__(self, world: BenchWorld, folder: Path) -> None:
+    def __init__(self, world: LineWorld, folder: Path) -> None:
         self.world, self.folder = world, folder
         self.port = os.open(folder / "board", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         self.sequence, self.replies = 0, b""
@@ -494,8 +490,8 @@ class Client:
 class TestServer:
     @pytest.fixture
     def path(self, experiment: Experiment, tmp_path: Path, ear: socket.socket) -> Iterator[Path]:
-        bench = ServoBench(bench_settings(ear))
-        thread = threading.Thread(target=bench.serve, args=(BenchRequest(experiment, tmp_path),))
+        bench = ServoBenchAtLine(bench_settings(ear))
+        thread = threading.Thread(target=bench.serve, args=(experiment, tmp_path))
         thread.start()
         yield tmp_path / "clock"
         if (tmp_path / "clock").exists():
@@ -536,15 +532,15 @@ class TestServer:
         self, experiment: Experiment, tmp_path: Path, ear: socket.socket, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """However long it takes to plug the board in: who waits for the clock finds both."""
-        start, early = BenchWorld.start, []
+        start, early = LineWorld.start, []
 
-        def slowly(world: BenchWorld, path: Path) -> None:
+        def slowly(world: LineWorld, path: Path) -> None:
             early.append((tmp_path / "clock").exists())
             start(world, path)
 
-        monkeypatch.setattr(BenchWorld, "start", slowly)
-        bench = ServoBench(bench_settings(ear))
-        thread = threading.Thread(target=bench.serve, args=(BenchRequest(experiment, tmp_path),))
+        monkeypatch.setattr(LineWorld, "start", slowly)
+        bench = ServoBenchAtLine(bench_settings(ear))
+        thread = threading.Thread(target=bench.serve, args=(experiment, tmp_path))
         thread.start()
         client = Client(tmp_path / "clock")
         assert early == [False] and (tmp_path / "board").exists()
@@ -571,42 +567,19 @@ class TestServer:
         client.close()
 
 
-class TestCommand:
-    def start(self, folder: Path, port: int, *more: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "armcal.cli", "simulated-bench", str(LRM / "bench.yaml"), "--dir", str(folder)]
-        sets = ["--set", f"bench.simulator.tracker.port={port}", *more]
-        return subprocess.Popen([*command, *sets], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    @pytest.mark.slow
-    def test_it_serves_until_it_is_told_to_end(self, tmp_path: Path, ear: socket.socket) -> None:
-        folder = tmp_path / "new" / "bench"
-        with self.start(folder, ear.getsockname()[1]) as process:
-            client = Client(folder / "clock")
-            assert client.ask(advance=1.0)["now"] == 1.0
-            assert client.ask(state=True)["violations"] == 0
-            second = CliRunner().invoke(cli, ["simulated-bench", str(LRM / "bench.yaml"), "--dir", str(folder)])
-            assert second.exit_code == 2 and "another simulated bench is running here" in second.stderr
-            process.send_signal(signal.SIGTERM)
-            said, told = process.communicate(timeout=60)
-        assert process.returncode == 0 and told == ""
-        assert said.startswith("simulated bench: ") and said.count("\n") == 1
-        assert len(heard(ear)) == 60
-
-    @pytest.mark.parametrize(
-        ("change", "told"),
-        [
-            ("bench.simulator.joints={q9: {speed_deg_per_s: 100}}", "no joint is called 'q9'"),
-            ("bench.simulator.measurement=camera", "bench.simulator.measurement: found camera"),
-            ("bench.simulator.without_effects=[quantum]", "no effect of arm is called 'quantum'"),
-            ("bench.simulator.servos=missing.yaml", "missing.yaml"),
-            ("bench.simulator.joints={all: {stall_Nm: 0}}", "stall"),
-            ("bench.simulator=null", "found no simulator of the bench"),
-        ],
-    )
-    def test_settings_that_do_not_fit_are_refused(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str, told: str
-    ) -> None:
-        monkeypatch.setattr(JsonServer, "serve", lambda *given: pytest.fail("a bench runs"))
-        arguments = ["simulated-bench", str(LRM / "bench.yaml"), "--dir", str(tmp_path / "bench"), "--set", change]
-        result = CliRunner().invoke(cli, arguments)
-        assert result.exit_code == 2 and told in result.stderr
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("bench.simulator.joints={q9: {speed_deg_per_s: 100}}", "no joint is called 'q9'"),
+        ("bench.simulator.measurement=camera", "bench.simulator.measurement: found camera"),
+        ("bench.simulator.without_effects=[quantum]", "no effect of arm is called 'quantum'"),
+        ("bench.simulator.servos=missing.yaml", "missing.yaml"),
+        ("bench.simulator.joints={all: {stall_Nm: 0}}", "stall"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str, told: str
+) -> None:
+    monkeypatch.setattr(JsonServer, "serve", lambda *given: pytest.fail("a bench runs"))
+    with pytest.raises(ArmcalError, match=re.escape(told)):
+        serve(Experiment.load(LRM / "bench.yaml", (*overrides_for(tmp_path), change)), tmp_path)

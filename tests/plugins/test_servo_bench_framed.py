@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal_simulation.boards.framed_board import BoardIdentity, FramedBoard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from servo_bench_parts import ADDRESS, BoardAtPty, board_at_pty
 
 from tests.arduino_sketch import SketchBoard, compiled
+from tests.simulated_lines.framed_board import BoardIdentity, FramedBoard
 
 HELLO, TAKE, WRITE, READ, SET, BEAT, GUARD, REFUSED = 0x01, 0x02, 0x10, 0x11, 0x12, 0x20, 0x21, 0xFF
 TOOK_OVER, GUARDED, STUCK = 1, 2, 4

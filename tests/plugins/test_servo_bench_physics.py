@@ -14,9 +14,9 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.parts import ServoBenchSettings, tracked_arm
 from armcal_simulation.bench.physics import ElasticPose
 from armcal_simulation.bench.servo_model import ServoHeat, ServoJointSettings, ServoModel
+from armcal_simulation.bench.truth import BenchTruthSettings, tracked_arm
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -33,7 +33,7 @@ def at(angle: float) -> float:
 
 
 def driven(servo: ServoModel, angle: float, seconds: float = 2.0, torque: float = 0.0) -> float:
-    servo.set_pulse(at(angle))
+    servo.command(at(angle))
     servo.advance(seconds, torque)
     return servo.angle
 
@@ -190,9 +190,9 @@ def truth() -> Path:
     return Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "truth.yaml"
 
 
-def bench_settings(truth: Path, **given: object) -> ServoBenchSettings:
+def bench_settings(truth: Path, **given: object) -> BenchTruthSettings:
     servos = truth.with_name("bench_servos.yaml")
-    return ServoBenchSettings.model_validate({"servos": str(servos), "truth": str(truth), **given})
+    return BenchTruthSettings.model_validate({"servos": str(servos), "truth": str(truth), **given})
 
 
 class TestElasticPose:

@@ -1,13 +1,16 @@
-"""Simulated benches: what stands in for board, arm and tracker when a measuring run is rehearsed."""
+"""Simulated benches: what stands in for board, arm and tracker when a command of a bench is rehearsed."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from armcal.devices.clock import Clock
+from armcal.devices.device import JointDevice
+from armcal.devices.live import JointStream, Tracker
 from armcal.run.experiment import Experiment
 
-BOARD, CLOCK, LOG = "board", "clock", "safety.jsonl"
-"""In a simulated bench's folder: the serial port (a link to a pty), the clock's socket, and what was unsafe."""
+ACCOUNT, LOG = "truth.json", "safety.jsonl"
+"""In a simulated bench's folder: its state, with what was unsafe, and a line for each that was."""
 
 
 @dataclass(frozen=True)
@@ -16,21 +19,50 @@ class BenchRequest:
 
     Attributes:
         experiment: its arm, measurements, nominal parameters, clearance (``plan.clearance``) and limits.
-        folder: where ``board``, ``clock`` and the log are to be; it is there.
+        folder: for account and log. Where an account is there, the bench goes on from it.
+        tool, base: what the session calls the bodies on the tool and at the arm's base.
     """
 
     experiment: Experiment
     folder: Path
+    tool: str
+    base: str
+
+
+class RunningBench(Protocol):
+    """A simulated bench while a session uses it. Time passes only while its clock sleeps.
+
+    Attributes:
+        clock: the session's.
+    """
+
+    clock: Clock
+
+    def device(self, configured: JointDevice, is_guarded: bool) -> JointDevice:
+        """What is opened in the place of the configured device, which is asked only for joints and settable angles.
+
+        ``is_guarded``: the configured link looks after the arm when its host falls silent.
+        """
+
+    def tracker(self, configured: Tracker) -> Tracker:
+        """What is opened in the place of the configured tracker."""
+
+    def joints(self, configured: JointStream) -> JointStream:
+        """What is opened in the place of the configured stream of joint readings."""
+
+    def close(self) -> None:
+        """Let go, and write the account: the state as JSON.
+
+        It has ``offences`` and ``events`` (how many, by kind), and the ``worst`` of each kind: ``joint``, ``value``,
+        and the ``limit`` of an offence.
+        """
 
 
 class SimulatedBench(Protocol):
-    """What a plugin provides to stand in for a bench, at the far end of a real pty and a real socket."""
+    """What a plugin provides to stand in for a bench."""
 
-    def serve(self, request: BenchRequest) -> None:
-        """Answer on the port and the clock's socket until SIGTERM, or until the clock's socket asks ``{"stop": true}``.
-
-        Requests of the clock's socket, beside ``{"advance": s}``: ``{"state": true}`` gives the truth, ``{"fault":
-        {...}}`` plants a fault. Returns when it is to stop.
+    def start(self, request: BenchRequest) -> RunningBench:
+        """A bench at its beginning, or from where its account left it.
 
         Raises:
             ConfigError: its settings do not fit the experiment.

@@ -52,7 +52,7 @@ class WiringRecord:
         device = {key: value for key, value in _section(source, "device").items() if key != "port"}
         stated = device.get("joints")
         parts = {key.rpartition(".")[2]: part for key, part in stated.items()} if isinstance(stated, dict) else {}
-        is_real = _section(source).get("clock", "real") == "real"
+        is_real = _section(source).get("simulated") is None
         names = [joint.rpartition(".")[2] for joint in joints]
         return cls(source.path, {name: _fingerprint([parts.get(name, device), is_real]) for name in names})
 

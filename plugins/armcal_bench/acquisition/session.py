@@ -521,7 +521,7 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
     except OSError as fault:
         raise InputError(f"it cannot be read ({fault}).", where=Location(str(plan)), hint="Give the plan.") from fault
     data = dict(plain(prepared.bench.experiment.source.data))
-    bench = {k: v for k, v in data.get("bench", {}).items() if k not in ("clock", "link", "simulator")}
+    bench = {k: v for k, v in data.get("bench", {}).items() if k not in ("simulated", "link", "simulator")}
     return {"plan": digest, "config": identity_of({**data, "bench": bench}), "began": time.time()}
 
 

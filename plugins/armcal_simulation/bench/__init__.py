@@ -1,1 +1,1 @@
-"""What every simulated bench has: time, arm, servos, tracker, line, faults, and what counts as unsafe."""
+"""The simulated bench: time, arm, servos, board, tracker, faults, and what counts as unsafe."""

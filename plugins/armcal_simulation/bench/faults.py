@@ -1,4 +1,4 @@
-"""Faults of a simulated bench as requests name them: checked, and kept until their time."""
+"""Faults of a simulated bench as they are stated: checked, and kept until their time."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from armcal.base.settings import Settings
 from pydantic import Field, ValidationError
 
-Count = Annotated[int, Field(ge=0, le=1_000_000)]
 Seconds = Annotated[float, Field(ge=0)]
 
 
@@ -17,18 +16,11 @@ class FaultRequest(Settings):
     """One fault."""
 
     kind: str  # which
-    at: Seconds | None = None  # when (simulated s; now by default)
-    after: Count = 0  # serial faults and ``nack``: how many messages or writes pass before it
-    count: Annotated[int, Field(ge=1, le=1_000_000)] = 1  # serial faults: to how many messages or bytes it happens
-    direction: Literal["to_host", "to_board"] = "to_board"  # serial faults
-    unit: Literal["frames", "bytes"] = "frames"  # serial faults: whole frames, or single bytes
-    byte: Annotated[int, Field(ge=-1, le=240)] = -1  # ``nack``: the index in the data; -1 is the address
-    seconds: Seconds = 0.05  # ``stuck``: for so long
-    joint: str | None = None  # ``disconnect`` to ``put``, and ``brown_out``, of smart servos: whose; all by default
+    at: Seconds | None = None  # when (simulated s; now, or at the beginning, by default)
+    joint: str | None = None  # of ``brown_out`` and of servos: whose; all by default
     angle: float = 0.0  # ``put``: where somebody moves the joint by hand (rad); one that holds stays
     body: str | None = None  # ``lost`` and ``seen``: which; all by default
     counter: Literal["rising", "same"] = "rising"  # ``frozen``: what the frame counter does
-    ppm: float = 0.0  # ``skew``: how much the tracker's clock gains
 
 
 class FaultCalendar:
@@ -37,10 +29,11 @@ class FaultCalendar:
     def __init__(
         self,
         clock: Callable[[], float],
-        apply: Callable[[FaultRequest], None],
+        apply: Callable[[Any], None],
         known: Mapping[str, Collection[str]],
+        requests: type[FaultRequest] = FaultRequest,
     ) -> None:
-        self._clock, self._apply, self._known = clock, apply, known
+        self._clock, self._apply, self._known, self._requests = clock, apply, known, requests
         self._waiting: list[tuple[float, int, FaultRequest]] = []
         self._planned = 0
 
@@ -56,7 +49,7 @@ class FaultCalendar:
                 mend = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(names)}."
                 raise ValueError(f"fault: found the {key} {name!r}, which this bench does not have: {mend}")
         try:
-            fault = FaultRequest.model_validate(content)
+            fault = self._requests.model_validate(content)
         except ValidationError as refused:
             first = refused.errors()[0]
             raise ValueError(f"fault: {'.'.join(map(str, first['loc']))}: {first['msg']}") from refused

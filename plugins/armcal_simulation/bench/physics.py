@@ -139,10 +139,17 @@ class BenchPhysics:
         servos: by joint, in the arm's order.
         frame_s: between the tracker's frames.
         seen: takes them.
+        now: when time begins (s).
     """
 
     def __init__(
-        self, servos: Mapping[str, JointServo], torques: Torques, pose: ElasticPose, frame_s: float, seen: Seen
+        self,
+        servos: Mapping[str, JointServo],
+        torques: Torques,
+        pose: ElasticPose,
+        frame_s: float,
+        seen: Seen,
+        now: float = 0.0,
     ) -> None:
         self.servos = dict(servos)
         self.heat = {joint: ServoHeat(servo.settings) for joint, servo in servos.items()}
@@ -151,8 +158,8 @@ class BenchPhysics:
         self._find_torques, self._find_pose = torques, pose
         self._frame_s, self._seen = frame_s, seen
         self._all = list(self.servos.items())
-        self._frames, self._slow, self._moved = 1, 1, True
-        self._now = 0.0
+        self._frames, self._slow, self._moved = int(now / frame_s) + 1, int(now / SLOW_S) + 1, True
+        self._now = now
         self._pose: Array | None = None
         self._yielding = True
         self._look_up_torques()
@@ -213,6 +220,7 @@ class BenchPhysics:
         joints = {
             joint: {
                 "angle_rad": servo.angle,
+                "shaft_rad": servo.shaft,
                 "target_rad": servo.target,
                 "approach": servo.approach,
                 "powered": servo.powered,
@@ -224,6 +232,13 @@ class BenchPhysics:
             for joint, servo in self._all
         }
         return {"joints": joints, "base_T_tool": None if base_T_body is None else base_T_body.tolist()}
+
+    def go_on(self, joints: Mapping[str, Any]) -> None:
+        """From where a state left the servos' heat."""
+        for joint, servo in self._all:
+            heat, left = self.heat[joint], joints[joint]
+            heat.winding, heat.case, servo.failed = left["winding"], left["case"], left["failed"]
+        self._yielding = self._gives_way()
 
     def _gives_way(self) -> bool:
         return any(servo.gives_way(self.torques[joint]) for joint, servo in self._all)

@@ -1,4 +1,4 @@
-"""What an arm was made to do, judged from the pulses at the pins alone, and what of it was unsafe."""
+"""What an arm was made to do, judged by what reaches its servos, and what of it was unsafe."""
 
 import json
 from collections import Counter, deque
@@ -12,7 +12,6 @@ from armcal.arm.clearance import ClearanceCheck
 from armcal.base.settings import Angle, Duration, Length, Settings
 
 from armcal_simulation.bench.servo_model import JointServo, Positive
-from armcal_simulation.boards.pca9685_model import COUNTS, Commit
 
 SPEED_SLACK = 1.05
 _TICK_S = 0.02  # hosts command at ticks: a command of a window's first moment may be of one tick before
@@ -23,8 +22,18 @@ _FOUND_RAD = 0.02
 """A first pulse that turns its joint by less takes it up where it stands: beyond a limit, that is nobody's offence."""
 
 
+@dataclass(frozen=True)
+class Commit:
+    """What reaches a servo changes at a time (s), from and to a pulse (s) or an angle (rad); None: it is let go."""
+
+    time: float
+    before: float | None
+    after: float | None
+    step: float = 0.0  # the smallest change that can be made
+
+
 class SafetySettings(Settings):
-    """What the arm must not be made to do, judged by the true pulse tables.
+    """What the arm must not be made to do, judged by the true servos.
 
     The commanded speed over ``window`` may be above ``rate_deg_per_s`` by a twentieth and one count. Joint limits and
     clearances are the plan's, less what a host cannot know of the true tables. Pulses are those that the true servo
@@ -80,8 +89,8 @@ class Safety:
         self._inherited = 0.0
         self._poses: list[tuple[float, bool, list[float]]] = []
 
-    def committed(self, joint: str, commit: Commit, period: float, torque: float) -> None:
-        """A change at a joint's pin, while its servo carried a torque (N m)."""
+    def committed(self, joint: str, commit: Commit, torque: float) -> None:
+        """A change at a joint's servo, while it carried a torque (N m)."""
         servo, now, settings = self._servos[joint], commit.time, self._settings
         if commit.after is None:
             self._commanded.pop(joint, None)
@@ -100,10 +109,10 @@ class Safety:
             self._beyond.pop(joint, None)
             if abs(jump) < _FOUND_RAD:
                 self._beyond[joint], self._taken_up = angle, True
-            self._weigh("first_pulse", joint, abs(jump), value=jump)
+            self._weigh("first_pulse", abs(jump), joint=joint, value=jump)
             self._note("first_pulse", joint, now, jump)
         else:
-            self._judge_speed(joint, commit, angle, period)
+            self._judge_speed(joint, commit, angle)
         self._commanded[joint] = angle
         self._past[joint].append((now, angle))
         judged = (
@@ -155,20 +164,28 @@ class Safety:
         """
         self.judge_clearance()
         for joint, angle in self._dropped.items():
-            self._weigh("drop", joint, abs(self._servos[joint].angle - angle), value=self._servos[joint].angle - angle)
+            fell = self._servos[joint].angle - angle
+            self._weigh("drop", abs(fell), joint=joint, value=fell)
         worst = {kind: entry for kind, (_, entry) in self._worst.items()}
         return {"offences": dict(self.offences), "events": dict(self.events), "worst": worst}
 
-    def _weigh(self, kind: str, joint: str, amount: float, **entry: float) -> None:
+    def go_on(self, account: Mapping[str, Any]) -> None:
+        """Count on from a summary."""
+        self.offences.update(account["offences"])
+        self.events.update(account["events"])
+        for kind, entry in account["worst"].items():
+            self._weigh(kind, abs(entry["value"] - entry.get("limit", 0.0)), **entry)
+
+    def _weigh(self, kind: str, amount: float, **entry: Any) -> None:
         """Remember it if it is the worst of its kind."""
         if kind not in self._worst or amount > self._worst[kind][0]:
-            self._worst[kind] = amount, {"joint": joint, **entry}
+            self._worst[kind] = amount, entry
 
-    def _judge_speed(self, joint: str, commit: Commit, angle: float, period: float) -> None:
+    def _judge_speed(self, joint: str, commit: Commit, angle: float) -> None:
         window, now, past = self._settings.window, commit.time, self._past[joint]
         while len(past) > 1 and past[1][0] <= now - window:
             past.popleft()
-        count = abs(self._servos[joint].angle_of((commit.after or 0.0) + period / COUNTS) - angle)
+        count = abs(self._servos[joint].angle_of((commit.after or 0.0) + commit.step) - angle)
         most = np.radians(self._settings.rate_deg_per_s)
         worst = 0.0
         for since, before in past:
@@ -179,7 +196,7 @@ class Safety:
 
     def _offend(self, kind: str, joint: str, now: float, value: float, limit: float) -> None:
         self.offences[kind] += 1
-        self._weigh(kind, joint, abs(value - limit), value=value, limit=limit)
+        self._weigh(kind, abs(value - limit), joint=joint, value=value, limit=limit)
         if (kind, joint) in self._logged:
             return
         self._logged.add((kind, joint))
@@ -192,6 +209,7 @@ class Safety:
 
 def appended_to(path: Path) -> Callable[[str], None]:
     def log(line: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8") as file:
             file.write(line + "\n")
 

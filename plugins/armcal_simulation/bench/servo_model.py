@@ -1,4 +1,4 @@
-"""A hobby servo: it drives to the angle of its pulses, as fast as it can, heats, and reports nothing.
+"""A servo: it drives to the angle that it is commanded, as fast as it can, gives way under its load, and heats.
 
 Two nodes carry its heat, in units in which a steady loss of 1 heats the winding by 1 above the air:
 ``loss = (torque / continuous)^2``. The winding lies inside the case, which the air cools; heat 1 is its limit.
@@ -27,7 +27,8 @@ class ServoJointSettings(Settings):
     ``friction``, at ``fall_deg_per_s``. Steadily under ``continuous`` torque its winding reaches its limit; beyond
     that it fails. ``winding_share`` of that rise lies between winding and case. ``winding_time`` and ``case_time`` are
     the time constants of each node against what it gives its heat to. Under its load the horn slips on the gear by
-    ``creep_deg_per_min`` for each N m, as with a loose screw.
+    ``creep_deg_per_min`` for each N m, as with a loose screw. Its load turns it by ``compliance_deg_per_Nm`` while it
+    holds. An encoder on the gear, where the device reads one, sees that, and has ``encoder_noise``.
     """
 
     speed_deg_per_s: Positive = 300.0
@@ -42,6 +43,8 @@ class ServoJointSettings(Settings):
     winding_time: Annotated[Duration, Field(gt=0)] = 60.0
     case_time: Annotated[Duration, Field(gt=0)] = 900.0
     winding_share: Annotated[float, Field(gt=0, lt=1)] = 0.3
+    compliance_deg_per_Nm: Annotated[float, Field(ge=0)] = 0.0
+    encoder_noise: Annotated[Angle, Field(ge=0)] = 4.6e-4
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
@@ -77,20 +80,38 @@ class JointServo:
         self._horn, self._slipped, self._creep = angle, 0.0, math.radians(settings.creep_deg_per_min) / 60.0
         self._gear = angle  # where the gear stands, without its backlash (rad)
         self._driving = False
+        self._compliance = math.radians(settings.compliance_deg_per_Nm)
         self._speed, self._fall_speed = math.radians(settings.speed_deg_per_s), math.radians(settings.fall_deg_per_s)
 
     @property
     def powered(self) -> bool:
         return self.target is not None and not self.failed
 
+    @property
+    def shaft(self) -> float:
+        """The angle (rad) at the encoder: of the gear, ahead of its backlash."""
+        return self._gear
+
     def angle_of(self, command: float) -> float:
         """The angle (rad) that a command asks for, as it reaches the servo: here an angle itself."""
         return command
 
+    def command(self, command: float | None) -> None:
+        """Drive to what a command asks for; None: let go."""
+        before, (low, high) = self.target, self.stops
+        self.target = None if command is None else min(max(self.angle_of(command), low), high)
+        if self._compliance and before is not None and self.target not in (None, before):
+            self.approach = 1 if self.target > before else -1
+
+    def put(self, angle: float) -> None:
+        """Somebody turns it by hand (rad), where it does not hold."""
+        if not self.powered:
+            self._gear = self._horn = self.angle = angle
+
     def rests(self, torque: float) -> bool:
         """Whether it stays where it is under a torque (N m), as it is driven now."""
         if self.holds(torque):
-            error = abs((self.target or 0.0) - self._gear)
+            error = abs(self._aim(torque) - self._gear)
             return error <= _NEAR or not (self._driving or error > self.settings.dead_band)
         low, high = self.stops
         at_stop = self._gear >= high - _NEAR if torque > 0 else self._gear <= low + _NEAR
@@ -110,7 +131,7 @@ class JointServo:
             return slips
         before = self._gear
         if self.holds(torque):
-            error, step = (self.target or 0.0) - before, self._speed * seconds
+            error, step = self._aim(torque) - before, self._speed * seconds
             self._driving = abs(error) > step
             self._gear += math.copysign(step, error) if self._driving else error
         else:
@@ -118,7 +139,7 @@ class JointServo:
             low, high = self.stops
             self._gear = min(max(before + (step if torque > 0 else -step), low), high)
         moved = self._gear - before
-        if moved:
+        if moved and not (self._compliance and self.powered):  # what its load turns it by is no motion of its own
             self.approach = 1 if moved > 0 else -1
         # the gear pushes the horn at one end of the gap
         half = self.settings.backlash / 2
@@ -129,6 +150,11 @@ class JointServo:
     def holds(self, torque: float) -> bool:
         """Whether it is strong enough for a torque (N m), as it is powered now."""
         return self.powered and abs(torque) <= self.settings.stall
+
+    def _aim(self, torque: float) -> float:
+        """Where the gear is drawn to: the target, less what the load makes it stand off."""
+        low, high = self.stops
+        return min(max((self.target or 0.0) + self._compliance * torque, low), high)
 
 
 class ServoModel(JointServo):
@@ -146,10 +172,6 @@ class ServoModel(JointServo):
         at = min(max(bisect_right(self._pulses, command), 1), len(self._pulses) - 1)
         p0, p1, a0, a1 = self._pulses[at - 1], self._pulses[at], self._angles[at - 1], self._angles[at]
         return a0 + (command - p0) * (a1 - a0) / (p1 - p0)
-
-    def set_pulse(self, pulse: float | None) -> None:
-        low, high = self.stops
-        self.target = None if pulse is None else min(max(self.angle_of(pulse), low), high)
 
 
 class ServoHeat:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from armcal_simulation.bench.serial_line import SerialLine
-from armcal_simulation.bus.packets import crc16
 from servo_bus_parts import BAUD, BusOnDesk, at_baud, packet
+
+from tests.simulated_lines.bus_packets import crc16
+from tests.simulated_lines.serial_line import SerialLine
 
 UNLOCK = ("lock", 0)
 

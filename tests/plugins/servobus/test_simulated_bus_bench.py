@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 from armcal.cli.main import cli
-from armcal.devices.simulated import BenchRequest
+from armcal.config.system import build_component
 from armcal.errors import ArmcalError
 from armcal.run.experiment import Experiment
-from armcal_bench.bench import Bench
-from armcal_simulation.bench.world import BenchWorld
-from armcal_simulation.bus.bus_bench import BusBench, BusWorld
-from bench_runs import free_port
 from click.testing import CliRunner
 from servo_bench_parts import read_all
 from servo_bus_parts import at_baud, packet
+
+from tests.bench_runs import bus_ids, free_port, overrides_for, serve
+from tests.simulated_lines.bus_bench import BusBenchAtLine, BusWorld
+from tests.simulated_lines.line_world import LineWorld
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "so101" / "bench.yaml"
 PAN, LIFT, ELBOW = 1, 2, 3
@@ -30,7 +30,7 @@ GOAL, SPEED = 42, 46
 class Host:
     """A host of a bench in this process, which speaks to servos by their ids."""
 
-    def __init__(self, world: BenchWorld, folder: Path) -> None:
+    def __init__(self, world: LineWorld, folder: Path) -> None:
         self.world, self.folder = world, folder
         self.port = os.open(folder / "board", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         at_baud(self.port)
@@ -65,14 +65,15 @@ class Host:
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     port = free_port()
-    return Experiment.load(CONFIG, (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}"))
+    ports = (f"bench.tracker.port={port}", f"bench.simulator.tracker.port={port}")
+    return Experiment.load(CONFIG, (*bus_ids(), *ports, *overrides_for(Path(), "device")))
 
 
 def settings(experiment: Experiment, **joints: dict[str, Any]) -> Any:
-    bench = Bench.of(experiment).simulator()
-    assert isinstance(bench, BusBench)
-    own = {name: bench._settings.joints[name].model_copy(update=more) for name, more in joints.items()}
-    return bench._settings.model_copy(update={"joints": {**bench._settings.joints, **own}})
+    bench, _ = build_component(experiment.source, experiment.registry, "bench", ("bench", "simulator"))
+    assert isinstance(bench, BusBenchAtLine)
+    own = {name: bench.settings.joints[name].model_copy(update=more) for name, more in joints.items()}
+    return bench.settings.model_copy(update={"joints": {**bench.settings.joints, **own}})
 
 
 @pytest.fixture
@@ -212,10 +213,7 @@ def test_what_a_servo_reads_at_its_joints_zero(
 )
 def test_settings_that_do_not_fit_are_refused(change: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(ArmcalError, match=says):
-        experiment = Experiment.load(CONFIG, (change,))
-        BenchRequest(experiment, tmp_path)
-        bench = Bench.of(experiment).simulator()
-        bench.serve(BenchRequest(experiment, tmp_path))
+        serve(Experiment.load(CONFIG, (*bus_ids(), *overrides_for(tmp_path, "device"), change)), tmp_path)
 
 
 @pytest.mark.slow
@@ -225,10 +223,7 @@ def test_a_rehearsal_measures_its_poses_and_is_safe(tmp_path: Path) -> None:
         f"{joint}_deg" for joint in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
     )
     plan.write_text(f"{head}\na,10,-40,-20,10,30\nb,-10,-30,0,0,-30\nc,5,-35,-10,-20,0\n")
-    port = free_port()
-    ports = [f"bench.{part}.port={port}" for part in ("tracker", "simulator.tracker")]
-    sets = [word for text in ports for word in ("--set", text)]
-    words = ["rehearse", str(CONFIG), "--plan", str(plan), "--out", str(tmp_path / "r"), *sets]
+    words = ["rehearse", str(CONFIG), "--plan", str(plan), "--out", str(tmp_path / "r")]
     done = CliRunner().invoke(cli, words)
     assert done.exit_code == 0, done.output
     assert "3 of 3 poses measured" in done.output

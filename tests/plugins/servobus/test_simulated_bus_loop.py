@@ -18,12 +18,12 @@ import pytest
 import yaml
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
-from armcal.devices.clock import SimulatedClock
-from armcal.devices.simulated import BOARD, CLOCK
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.rehearsal import overrides_for, simulated_bench
 from armcal_bench.bench import Bench
-from bench_runs import free_port
+
+from tests.bench_runs import free_port, overrides_for, simulated_bench
+from tests.simulated_lines.line_world import BOARD, CLOCK
+from tests.simulated_lines.socket_clock import SimulatedClock
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "so101"
 POSES, FRESH = 40, 20
@@ -106,7 +106,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Loop]:
         words = ("acquire", config, "--plan", folder / "plan.csv", "--dry-run", "--json")
         return str(json.loads(bench(*words))["unchecked"])
 
-    with simulated_bench(config, ports, folder / "bench"):
+    with simulated_bench(config, ports, folder / "bench", "device"):
         clock = SimulatedClock(folder / "bench" / CLOCK)
         found = json.loads(desk("bus", "find", folder / "bench" / BOARD, "--last-id", "8", "--json"))
         ids = [(servo["baud"], servo["id"], servo["model"]) for servo in found["servos"]]

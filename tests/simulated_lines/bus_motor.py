@@ -7,15 +7,16 @@ sees. Play lies between shaft and joint (spline, screws, bearings), which it doe
 import math
 from typing import Annotated
 
+from armcal.base.settings import Torque
+from armcal_simulation.bench.servo_model import JointServo, Positive
+from armcal_simulation.bench.truth import BenchJointSettings
 from pydantic import Field
 from typing_extensions import override
-
-from armcal_simulation.bench.servo_model import JointServo, Positive, ServoJointSettings
 
 _NEAR = 1e-9
 
 
-class BusMotorSettings(ServoJointSettings):
+class BusMotorSettings(BenchJointSettings):
     """What kind of motor it is, beside what all servos have; by default an STS3215 at 7.4 V.
 
     ``stall_A`` is what it draws at ``stall``; ``rise_K`` how much warmer its sensor is than the air when its winding
@@ -23,9 +24,9 @@ class BusMotorSettings(ServoJointSettings):
     """
 
     speed_deg_per_s: Positive = 270.0
-    stall: Annotated[float, Field(gt=0)] = 1.9
-    friction: Annotated[float, Field(ge=0)] = 0.25
-    continuous: Annotated[float, Field(gt=0)] = 1.0
+    stall: Annotated[Torque, Field(gt=0)] = 1.9
+    friction: Annotated[Torque, Field(ge=0)] = 0.25
+    continuous: Annotated[Torque, Field(gt=0)] = 1.0
     compliance_deg_per_Nm: Annotated[float, Field(ge=0)] = 0.8
     encoder_noise_counts: Annotated[float, Field(ge=0)] = 0.3
     stall_A: Positive = 2.4
@@ -46,16 +47,10 @@ class BusMotor(JointServo):
 
     def __init__(self, settings: BusMotorSettings, angle: float) -> None:
         super().__init__(settings, angle)
-        self._compliance = math.radians(settings.compliance_deg_per_Nm)
         self.torque, self.torque_share = 0.0, 1.0
         self.setpoint: float | None = None
         self.goal, self.speed, self.acceleration = angle, self._speed, 0.0
         self._profile_speed = 0.0
-
-    @property
-    def shaft(self) -> float:
-        """The angle (rad) at the encoder."""
-        return self._gear
 
     @property
     def moving(self) -> bool:
@@ -88,12 +83,7 @@ class BusMotor(JointServo):
             self._profile_speed = 0.0
         elif not on:
             self.setpoint = None
-        self._aim()
-
-    def put(self, angle: float) -> None:
-        """Somebody turns it by hand (rad), where it does not hold."""
-        if not self.powered:
-            self._gear = self._horn = self.angle = angle
+        self._send()
 
     @override
     def holds(self, torque: float) -> bool:
@@ -113,7 +103,7 @@ class BusMotor(JointServo):
         if self.setpoint is not None:
             before = self.setpoint
             self._follow(seconds)
-            self._aim()
+            self._send()
             if self.setpoint != before:
                 side = 1 if self.setpoint > before else -1
         moved = super().advance(seconds, torque)
@@ -121,11 +111,9 @@ class BusMotor(JointServo):
             self.approach = side  # what its load turns it by is no motion of its own
         return moved
 
-    def _aim(self) -> None:
-        """Where the shaft is drawn to: the set point, less what the load makes it stand off."""
-        low, high = self.stops
-        aim = None if self.setpoint is None else self.setpoint + self._compliance * self.torque
-        self.target = None if aim is None else min(max(aim, low), high)
+    def _send(self) -> None:
+        """The shaft is drawn to the set point, less what the load makes it stand off."""
+        self.target = self.setpoint
 
     def _follow(self, seconds: float) -> None:
         """Move the set point on along a trapezoid of speed."""

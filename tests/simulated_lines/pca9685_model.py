@@ -25,7 +25,7 @@ _REMEMBERED = 100_000
 
 
 @dataclass(frozen=True)
-class Commit:
+class PinCommit:
     """A change at a pin: pulse lengths (s) before and after; None where there are no pulses."""
 
     time: float
@@ -65,9 +65,9 @@ class Pca9685Model:
         external_hz: float | None = None,
     ) -> None:
         self.address, self.oscillator_hz = address, oscillator_hz
-        self.commits: deque[Commit] = deque(maxlen=_REMEMBERED)
+        self.commits: deque[PinCommit] = deque(maxlen=_REMEMBERED)
         self.violations: deque[Violation] = deque(maxlen=_REMEMBERED)
-        self.on_commit: Callable[[Commit], None] = lambda commit: None
+        self.on_commit: Callable[[PinCommit], None] = lambda commit: None
         self._clock, self._external_hz = clock, external_hz
         self._pins: list[float | None] = [None] * CHANNELS
         self._set_defaults()
@@ -297,7 +297,7 @@ class Pca9685Model:
             before, after = self._pins[channel], self._at_pin(channel)
             if before != after:
                 self._pins[channel] = after
-                commit = Commit(self._clock(), channel, before, after)
+                commit = PinCommit(self._clock(), channel, before, after)
                 self.commits.append(commit)
                 self.on_commit(commit)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-from armcal_simulation.bus.packets import ProtocolName
+from tests.simulated_lines.bus_packets import ProtocolName
 
 Area = Literal["eeprom", "ram", "read"]
 _RPM = 2 * math.pi / 60

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armcal_simulation.bus.motor import BusMotor
-from armcal_simulation.bus.packets import ACTION, FACTORY_RESET, PING, READ, REBOOT, REG_WRITE, WRITE
-from armcal_simulation.bus.registers import Register, ServoTable
+from tests.simulated_lines.bus_motor import BusMotor
+from tests.simulated_lines.bus_packets import ACTION, FACTORY_RESET, PING, READ, REBOOT, REG_WRITE, WRITE
+from tests.simulated_lines.bus_registers import Register, ServoTable
 
 UNDERVOLTAGE, ANGLE_LIMIT, OVERHEAT, RANGE, CHECKSUM, OVERLOAD, INSTRUCTION = 1, 2, 4, 8, 16, 32, 64
 """Bits of a status byte; the first, third and sixth also of protocol 2's hardware error status."""

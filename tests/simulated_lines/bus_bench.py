@@ -1,4 +1,4 @@
-"""The simulated bench ``bus_bench``: smart servos on a bus at a pty, an arm that they carry, and a tracker."""
+"""The bench ``bus_bench_at_line``: smart servos on a bus at a pty, an arm that they carry, and a tracker."""
 
 import math
 from collections.abc import Mapping
@@ -8,21 +8,19 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import SPLINE_TEETH
-from armcal.devices.simulated import BenchRequest, SimulatedBench
+from armcal.devices.simulated import BenchRequest, RunningBench, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
+from armcal_simulation.bench.safety import Commit, SafetySettings
+from armcal_simulation.bench.truth import ALL, bounds_of, tracked_arm
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
 
-from armcal_simulation.bench.faults import FaultRequest
-from armcal_simulation.bench.parts import ALL, BenchTruthSettings, bounds_of, merged, tracked_arm
-from armcal_simulation.bench.safety import SafetySettings
-from armcal_simulation.bench.world import BenchWorld
-from armcal_simulation.boards.pca9685_model import Commit
-from armcal_simulation.bus.motor import BusMotor, BusMotorSettings
-from armcal_simulation.bus.registers import TABLES, ServoTable
-from armcal_simulation.bus.servo import BusServo
-from armcal_simulation.bus.servo_bus import ServoBus
+from tests.simulated_lines.bus_motor import BusMotor, BusMotorSettings
+from tests.simulated_lines.bus_registers import TABLES, ServoTable
+from tests.simulated_lines.bus_servo import BusServo
+from tests.simulated_lines.line_world import BenchAtLine, LineTruthSettings, LineWorld
+from tests.simulated_lines.servo_bus import ServoBus
 
 _TURN = 2 * math.pi
 _BURNING = 0.95
@@ -56,7 +54,7 @@ class BusJointSettings(BusMotorSettings):
         return TABLES[self.model]
 
 
-class BusBenchSettings(BenchTruthSettings):
+class BusBenchSettings(LineTruthSettings):
     """The truth of a bench with smart servos; ``joints`` has them by joint, and what ``all`` have in common.
 
     ``baud`` is that of the servos, ``echo`` whether the adapter hears itself. ``supply_V`` sags by ``supply_ohm``.
@@ -77,9 +75,6 @@ class BusBenchSettings(BenchTruthSettings):
             raise ValueError(f"found servos of {' and '.join(sorted(stated))}, expected one protocol: it is one bus")
         return self
 
-    def servo_of(self, joint: str) -> BusJointSettings:
-        return merged(self.joints, joint, BusJointSettings)
-
     def baud_code(self, servo: BusJointSettings) -> int:
         """What stands in a servo's baud register.
 
@@ -94,14 +89,16 @@ class BusBenchSettings(BenchTruthSettings):
         raise ConfigError(f"bench.simulator: found {baud} baud, expected one of {rates} for {servo.model}.")
 
 
-class BusWorld(BenchWorld):
+class BusWorld(LineWorld):
     """Smart servos on their bus. Motors are judged by the set points that they follow.
 
     Raises:
         ConfigError: the settings do not fit the experiment.
     """
 
-    faults: ClassVar[tuple[str, ...]] = ("reset", "brown_out", "disconnect", "connect", "jam", "free", "heat", "put")
+    kinds: ClassVar[tuple[str, ...]] = (
+        *LineWorld.kinds, "reset", "brown_out", "disconnect", "connect", "jam", "free", "heat", "put",
+    )  # fmt: skip
 
     def __init__(self, settings: BusBenchSettings, experiment: Experiment, folder: Path) -> None:
         tracked = tracked_arm(settings, experiment)
@@ -114,7 +111,7 @@ class BusWorld(BenchWorld):
         random = np.random.default_rng([settings.seed, 2])
         self._servos = {joint: _bus_servo(settings, joint, random) for joint in names}
         motors = {joint: servo.motor for joint, servo in self._servos.items()}
-        super().__init__(settings, tracked, motors, bounds_of(experiment, {}), folder)
+        super().__init__(settings, tracked, motors, bounds_of(experiment, None), folder)
         supply, chain = (settings.supply_V, settings.supply_ohm), list(self._servos.values())
         self._bus = ServoBus(self.clock, chain, self.send, self.baud, random, echo=settings.echo, supply=supply)
         self.split = self._bus.split
@@ -149,11 +146,11 @@ class BusWorld(BenchWorld):
             before, now = self._setpoints[joint], servo.motor.setpoint
             if before != now:
                 self._setpoints[joint] = now
-                commit = Commit(self.now, servo.id, before, now)
-                self.safety.committed(joint, commit, _TURN, self.physics.torques[joint])
+                commit = Commit(self.now, before, now, _TURN / 4096)
+                self.safety.committed(joint, commit, self.physics.torques[joint])
 
     @override
-    def fail(self, fault: FaultRequest) -> None:
+    def fail(self, fault: Any) -> None:
         for joint, servo in self._servos.items():
             if fault.joint not in (None, joint):
                 continue
@@ -173,6 +170,7 @@ class BusWorld(BenchWorld):
                 self.physics.heat[joint].winding = _BURNING
         self.moved()
         self.physics.commands_changed()
+        super().fail(fault)
 
     @override
     def state(self) -> dict[str, Any]:
@@ -187,26 +185,25 @@ class BusWorld(BenchWorld):
             }
             for joint, servo in self._servos.items()
         }
-        return {"bus": servos, "volts": self._bus.volts()}
+        return {**super().state(), "bus": servos, "volts": self._bus.volts()}
 
 
-class BusBench(SimulatedBench):
-    """The simulated bench ``bus_bench``; time and determinism are those of ``servo_bench``."""
+class BusBenchAtLine(SimulatedBench):
+    """The bench ``bus_bench_at_line``; see ``ServoBenchAtLine``."""
 
     Settings: ClassVar[type[BusBenchSettings]] = BusBenchSettings
-    EXAMPLE: ClassVar[Mapping[str, Any]] = {
-        "truth": "truth.yaml",
-        "joints": {"all": {"backlash_deg": 0.6}, "q1": {"id": 1}, "q2": {"id": 2, "zero_count": 2100}},
-        "tracker": {"port": 5000, "noise_mm": 0.05},
-        "seed": 1,
-    }
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"joints": {"q1": {"id": 1}}}
 
     def __init__(self, settings: BusBenchSettings) -> None:
-        self._settings = settings
+        self.settings = settings
 
     @override
-    def serve(self, request: BenchRequest) -> None:
-        BusWorld(self._settings, request.experiment, request.folder).serve()
+    def start(self, request: BenchRequest) -> RunningBench:
+        return BenchAtLine(request)
+
+    def serve(self, experiment: Experiment, folder: Path) -> None:
+        """Until its end."""
+        BusWorld(self.settings, experiment, folder).serve()
 
 
 def _bus_servo(settings: BusBenchSettings, joint: str, random: np.random.Generator) -> BusServo:

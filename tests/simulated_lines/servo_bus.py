@@ -6,7 +6,7 @@ from operator import and_
 
 import numpy as np
 
-from armcal_simulation.bus.packets import (
+from tests.simulated_lines.bus_packets import (
     BROADCAST,
     BULK_READ,
     FRAMINGS,
@@ -17,7 +17,7 @@ from armcal_simulation.bus.packets import (
     Instruction,
     ProtocolName,
 )
-from armcal_simulation.bus.servo import BAD_CRC, CHECKSUM, BusServo
+from tests.simulated_lines.bus_servo import BAD_CRC, CHECKSUM, BusServo
 
 LOOK_S = 0.1  # how often servos look at their temperature, voltage and load
 _BAUD_TOLERANCE = 0.02

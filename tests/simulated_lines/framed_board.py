@@ -25,7 +25,7 @@ from armcal.devices.framed.messages import (
     packed_head,
 )
 
-from armcal_simulation.boards.pca9685_model import COUNTS, FULL, LED0, BusStuckError, I2cBus
+from tests.simulated_lines.pca9685_model import COUNTS, FULL, LED0, BusStuckError, I2cBus
 
 TICK_S = 0.02
 _RATE_UNIT = 16  # rates come in so many parts of a count per second

@@ -1,1 +1,0 @@
-"""Servo boards with a PCA9685, and the hobby servos that they drive."""

@@ -1,1 +1,0 @@
-"""Smart servos on a serial bus."""
