@@ -146,12 +146,10 @@ def _sweep_of(
     stated = servo.pulses_at(servo.angles) / tick
     if not lines and not seen:
         return "nothing was measured"
-    if not lines:  # somebody put the joint there: as if a tracker had seen the model's tool
-        poses = np.array([rigid.tool({joint: line["target"]}) for line in seen])
-        sds, axis = np.array([line["sd"] for line in seen]), rigid.axis(joint, {})[0]
-        everything, targets = np.ones(len(seen), dtype=bool), np.array([line["target"] for line in seen])
-        sweep = _Sweep(servo, seen, "somebody", poses, sds, axis, poses[:, :3, 3], stated, everything)
-        return _with_first_table(sweep, targets, stated)
+    if not lines:
+        poses, everything = np.tile(np.eye(4), (len(seen), 1, 1)), np.ones(len(seen), dtype=bool)
+        sds, nowhere = np.array([line["sd"] for line in seen]), np.zeros((len(seen), 3))
+        return _Sweep(servo, seen, "somebody", poses, sds, np.zeros(3), nowhere, stated, everything)
     others = _others(lines, joint)
     axis, origin = rigid.axis(joint, {**others, joint: 0.0})
     poses = np.tile(np.eye(4), (len(lines), 1, 1))
@@ -209,26 +207,81 @@ def _fitted(
     arm: Arm,
     settings: ServoCalibrationSettings,
 ) -> Outcome:
-    """Sweeps of a tracker's rotations have a problem, those of its positions one, and each of somebody's eyes."""
+    """Sweeps of a tracker's rotations have a problem, and those of its positions; what somebody saw needs no model."""
     tracked = all(sweep.by != "somebody" for sweep in sweeps.values())
     zero: Zero = "kept" if settings.zero == "kept" and tracked else "measured"
     servos: dict[str, FittedServo] = {}
     silent: dict[str, str] = {}
     compliances: dict[str, tuple[float, float]] = {}
     spans: dict[str, float] = {}
-    together: dict[tuple[str, str], dict[str, _Sweep]] = {}
-    for joint, sweep in sweeps.items():
-        together.setdefault((sweep.by, joint if sweep.by == "somebody" else ""), {})[joint] = sweep
-    for own in together.values():
-        fit = _TableFit(own, rigid, experiment, arm, settings, zero, clocks)
-        silent |= fit.run()
-        servos |= {joint: fit.servo(joint) for joint in own if joint not in silent}
-        compliances |= fit.compliances()
-        spans |= fit.sag_spans()
+    for by in ("rotation", "position"):
+        if own := {joint: sweep for joint, sweep in sweeps.items() if sweep.by == by}:
+            fit = _TableFit(own, rigid, experiment, arm, settings, zero, clocks)
+            silent |= fit.run()
+            servos |= {joint: fit.servo(joint) for joint in own if joint not in silent}
+            compliances |= fit.compliances()
+            spans |= fit.sag_spans()
+    by_eye = {joint: sweep for joint, sweep in sweeps.items() if sweep.by == "somebody"}
+    servos |= {joint: _by_eye(sweep, clocks[sweep.known.board].tick) for joint, sweep in by_eye.items()}
     known = {name: change for name, change in compliances.items() if change[1] < _DETERMINED * settings.sag_sd}
     fitted = settings.sag == "fitted"
     undetermined = tuple(name for name in compliances if name not in known and fitted)
     return Outcome(servos, clocks, silent, known if fitted else {}, undetermined, zero, spans)
+
+
+def _by_eye(sweep: _Sweep, tick: float) -> FittedServo:
+    """A table of straight lines through the pulses at which somebody saw angles (``tick`` in s)."""
+    knots, targets = sweep.known.angles, np.array([line["target"] for line in sweep.lines])
+    stated, hats = sweep.known.pulses_at(knots), piecewise(knots, np.eye(len(knots)))
+    steep = piecewise(knots, stated).derivative()(targets)
+    came = np.array([float(line["came"]) for line in sweep.lines]) * np.sign(stated[-1] - stated[0])
+    has_lag = len(np.unique(came)) > 1
+    columns = np.column_stack([hats(targets), *([steep * came] if has_lag else [])])
+    weak = np.eye(len(knots), columns.shape[1]) / (WEAK_SD * np.abs(np.gradient(stated, knots)))[:, None]
+    pulses, kept, scale = sweep.counts * tick, sweep.kept, 1.0
+    for _ in range(3):
+        weights = kept / (sweep.sds * np.abs(steep))
+        rows = np.vstack([columns * weights[:, None], weak])
+        right = np.concatenate([pulses * weights, weak[:, : len(knots)] @ stated])
+        solution = np.linalg.lstsq(rows, right, rcond=None)[0]
+        off = (pulses - columns @ solution) / steep
+        kept = np.abs(off / sweep.sds) <= _FAR_OFF * max(1.0, 1.4826 * float(np.median(np.abs(off / sweep.sds))))
+    sizes, freedom = (off / sweep.sds)[kept], int(kept.sum()) - columns.shape[1]
+    scale = float(np.sqrt(sizes @ sizes / freedom)) if freedom > 0 else 1.0
+    sds = np.sqrt(np.diag(np.linalg.pinv(rows.T @ rows, hermitian=True))) * max(1.0, scale)
+    sweep.kept = kept
+    lag = (float(solution[-1]), float(sds[-1])) if has_lag else (None, math.nan)
+    return _fitted_servo(sweep, solution[: len(knots)], sds[: len(knots)], lag, off, scale, targets)
+
+
+def _fitted_servo(
+    sweep: _Sweep,
+    pulses: Array,
+    sds: Array,
+    lag: tuple[float | None, float],
+    off: Array,
+    scale: float,
+    angles: Array,
+) -> FittedServo:
+    """Pulses at the knots and their deviations (s), half the backlash with its own, what is left (rad), and angles."""
+    known, kept = sweep.known, sweep.kept
+    stated = known.pulses_at(known.angles)
+    determined = sds < _DETERMINED * WEAK_SD * np.abs(np.gradient(pulses, known.angles))
+    return FittedServo(
+        known=known,
+        angles=tuple(known.angles.tolist()),
+        pulses=tuple(np.where(determined, pulses, stated).tolist()),
+        pulse_sds=tuple(np.where(determined, sds, np.nan).tolist()),
+        determined=tuple(determined.tolist()),
+        lag=lag[0],
+        lag_sd=lag[1],
+        scatter=float(np.sqrt(np.mean(off[kept] ** 2))) if kept.any() else 0.0,
+        scale=scale,
+        used=int(kept.sum()),
+        outliers=tuple((int(sweep.counts[i]), float(angles[i] + off[i])) for i in np.flatnonzero(~kept)),
+        reach=(float(angles[kept].min()), float(angles[kept].max())) if kept.any() else (0.0, 0.0),
+        by=sweep.by,
+    )
 
 
 class _TableFit:
@@ -248,19 +301,18 @@ class _TableFit:
         self._sweeps, self._rigid, self._arm, self._settings = sweeps, rigid, arm, settings
         self._by = next(iter(sweeps.values())).by
         self._keeps_zero = zero == "kept"
-        self._has_zero = self._by != "somebody"
         self._numbers = {joint: arm.joint_names.index(joint) + 1 for joint in sweeps}
         lags = [self._numbers[j] for j, s in sweeps.items() if len(np.unique(s.approaches)) > 1]
         self._lags = {joint for joint, number in self._numbers.items() if number in lags}
         knots = {self._numbers[joint]: sweep.known.angles.tolist() for joint, sweep in sweeps.items()}
-        corrections = Corrections(knots, list(self._numbers.values()) if self._has_zero else [], lags)
+        corrections = Corrections(knots, list(self._numbers.values()), lags)
         by: Literal["rotation", "position"] = "position" if self._by == "position" else "rotation"
         seat = quaternion_of(mean_rotation(self._seats())) if self._by == "rotation" else NO_TURN
         body = Body((arm.name,), by, seat, sweeps=len(sweeps))
-        has_springs = self._has_zero and settings.sag != "none"
+        has_springs = settings.sag != "none"
         free = self._free(experiment, body, corrections, has_springs)
         self._fit = BodyFit(experiment, arm, corrections, body, free, self._seen(), springs=has_springs)
-        for joint in sweeps if self._has_zero else ():
+        for joint in sweeps:
             self._fit.move(self._zero(joint), self._zeroed(joint))
         self._compliances = [name for name in free if name.startswith(f"{arm.name}.") and self._is_compliance(name)]
 
@@ -291,8 +343,6 @@ class _TableFit:
         for block in corrections.parameters():
             sd = _ZERO_SD if block.name.startswith("zero") else None if block.name.startswith("lag") else WEAK_SD
             free[f"{arm.name}.{TABLES}.{block.name}"] = sd
-        if self._by == "somebody":
-            return free
         scope = f"{arm.name}.{arm.model_name}."
         nominal = {block.name: block for block in experiment.parameters.blocks if block.name in own}
         springy = {f"{arm.name}.{name}." for name in arm.effects} if springs else set()
@@ -320,7 +370,7 @@ class _TableFit:
         """How the body sits on the nominal tool, line by line."""
         return np.array(
             [
-                self._rigid.tool({**line.get("told", {}), joint: angle})[:3, :3].T @ pose[:3, :3]
+                self._rigid.tool({**line["told"], joint: angle})[:3, :3].T @ pose[:3, :3]
                 for joint, sweep in self._sweeps.items()
                 for line, angle, pose in zip(sweep.lines, sweep.angles, sweep.poses, strict=True)
             ]
@@ -333,7 +383,7 @@ class _TableFit:
         for joint, sweep in self._sweeps.items():
             for other in joints:
                 own = other == joint
-                stood = np.array([float(line.get("told", {}).get(other, 0.0)) for line in sweep.lines])
+                stood = np.array([float(line["told"].get(other, 0.0)) for line in sweep.lines])
                 rows[other].append(sweep.angles if own else stood)
                 sides[other].append(sweep.approaches if own else np.zeros(len(stood)))
         sweeps = list(self._sweeps.values())
@@ -376,7 +426,7 @@ class _TableFit:
                 largest = max(largest, float(np.abs(at).max()))
                 if not sweep.corrected(at):
                     silent[joint] = _NO_TABLE
-                elif self._has_zero:
+                else:
                     moved = self._fit.value(names[0]) - at[0]
                     self._fit.move(self._zero(joint), self._fit.value(self._zero(joint)) + moved)
                 for name in names:
@@ -396,8 +446,6 @@ class _TableFit:
         """What of the corrections at the knots is the joint's zero instead: that at zero, or their mean."""
         sweep = self._sweeps[joint]
         hats = piecewise(sweep.known.angles, np.eye(len(sweep.known.angles)))
-        if not self._has_zero:
-            return np.zeros(len(sweep.known.angles))
         return np.asarray(hats(0.0) if self._keeps_zero else hats(sweep.angles).mean(axis=0))
 
     def _off(self) -> dict[str, Array]:
@@ -407,44 +455,25 @@ class _TableFit:
 
     def servo(self, joint: str) -> FittedServo:
         """By the last fit; pulses by the stated oscillator."""
-        tick = self._ticks[joint]
         sweep, names, off = self._sweeps[joint], self._names(joint), self._off()[joint]
-        lag_name = f"{self._arm.name}.{TABLES}.lag{self._numbers[joint]}"
-        used = int(sweep.kept.sum())
-        freedom = used - len(names) - (joint in self._lags) - self._has_zero
         sizes = (off / sweep.sds)[sweep.kept]
+        freedom = len(sizes) - len(names) - (joint in self._lags) - 1
         scale = float(np.sqrt(sizes @ sizes / freedom)) if freedom > 0 else 1.0
+        slopes, shift = np.abs(np.gradient(sweep.pulses, sweep.known.angles)), self._absolute(joint)
         rows = np.eye(len(names)) - self._pinned(joint)
-        slopes = np.abs(np.gradient(sweep.pulses, sweep.known.angles)) * tick
-        shift = self._absolute(joint)
-        pulses = sweep.pulses * tick
-        if shift:
-            pulses = np.asarray(piecewise(sweep.known.angles + shift, pulses)(sweep.known.angles))
         sds = slopes * self._fit.deviations(names, rows) * max(1.0, scale)
-        determined = sds < _DETERMINED * WEAK_SD * slopes
-        stated = sweep.known.pulses_at(sweep.known.angles)
-        lag = self._fit.value(lag_name) if joint in self._lags else None
-        lag_sd = float(self._fit.deviations([lag_name])[0]) * max(1.0, scale) if joint in self._lags else math.nan
-        angles = sweep.angles + shift - (lag or 0.0) * sweep.approaches
-        return FittedServo(
-            known=sweep.known,
-            angles=tuple(sweep.known.angles.tolist()),
-            pulses=tuple(np.where(determined, pulses, stated).tolist()),
-            pulse_sds=tuple(np.where(determined, sds, np.nan).tolist()),
-            determined=tuple(determined.tolist()),
-            lag=lag,
-            lag_sd=lag_sd,
-            scatter=float(np.sqrt(np.mean(off[sweep.kept] ** 2))) if used else 0.0,
-            scale=scale,
-            used=used,
-            outliers=tuple((int(sweep.counts[i]), float(angles[i] + off[i])) for i in np.flatnonzero(~sweep.kept)),
-            reach=(float(angles[sweep.kept].min()), float(angles[sweep.kept].max())) if used else (0.0, 0.0),
-            by=sweep.by,
-        )
+        pulses = np.asarray(piecewise(sweep.known.angles + shift, sweep.pulses)(sweep.known.angles))
+        lag: tuple[float | None, float] = (None, math.nan)
+        if joint in self._lags:
+            name = f"{self._arm.name}.{TABLES}.lag{self._numbers[joint]}"
+            lag = self._fit.value(name), float(self._fit.deviations([name])[0]) * max(1.0, scale)
+        angles = sweep.angles + shift - (lag[0] or 0.0) * sweep.approaches
+        tick = self._ticks[joint]
+        return _fitted_servo(sweep, pulses * tick, sds * tick, lag, off, scale, angles)
 
     def _absolute(self, joint: str) -> float:
         """What is to be added to the table's angles for them to be absolute, by the stated model and base."""
-        if self._keeps_zero or not self._has_zero:
+        if self._keeps_zero:
             return 0.0
         parameters, fitted = self._fit.parameters, (*self._compliances, *self._names(joint))
         lags = f"{self._arm.name}.{TABLES}.lag"
