@@ -43,7 +43,7 @@ def given(words: list[str], folder: Path) -> str:
 
 @pytest.mark.slow
 def test_the_page_on_servos_calibrates_those_of_the_sound_bench(folder: Path) -> None:
-    (command,) = shown("servo.md", "rehearse")
+    (command,) = shown("bench.md", "rehearse")
     said = given(command, folder)
     assert "times those of the model" not in said and "unsafe was: nothing" in said
     found = yaml.safe_load((folder / "runs" / "servo" / "servo.json").read_text())["servos"]
@@ -57,8 +57,8 @@ def test_the_page_on_servos_calibrates_those_of_the_sound_bench(folder: Path) ->
 
 @pytest.mark.slow
 def test_the_base_pose_on_the_page_on_servos_checks_all_joints_and_lets_them_cool(folder: Path) -> None:
-    base = re.search(r"\n    base: (\{.*\})\n", (ROOT / "docs" / "servo.md").read_text(encoding="utf-8"))
-    (command,) = shown("servo.md", "rehearse")
+    base = re.search(r"\n    base: (\{.*\})\n", (ROOT / "docs" / "bench.md").read_text(encoding="utf-8"))
+    (command,) = shown("bench.md", "rehearse")
     sets = ["--set", f"bench.servo.base={base and base[1]}"]
     said = given([*command[:2], "--servo", "check", "--out", "runs/check", *sets], folder)
     assert said.count(" turned by ") == 6 and "other way" not in said and "cannot be" not in said
