@@ -118,7 +118,7 @@ def test_at_a_worse_level_a_decision_advises_what_the_level_does() -> None:
 
 def test_the_last_good_record_is_known_however_long_ago_it_was() -> None:
     belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
-    state = State(belief, belief)
+    state = State(belief)
     for n in range(1, 3 * REMEMBERED):
         state = remembering(state, Arrival(f"p{n}", "", n, float(n), is_good=n <= 5))
     assert len(state.ids) == REMEMBERED and state.good == Arrival("p5", "", 5, 5.0, True)
