@@ -98,7 +98,7 @@ def test_a_time_is_a_date_only_where_it_can_be_one() -> None:
 def test_no_record_is_good_from_the_first_that_a_decision_affects() -> None:
     belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
     arrivals = tuple(Arrival(f"p{n}", "", n, float(n), is_good=n < 9) for n in range(1, 10))
-    state = State(belief, belief, ids=arrivals, sequence=9)
+    state = State(belief, ids=arrivals, sequence=9)
     found = Decision("unexplained", "Some records do not fit", "chance", 9.0, since=6)
     after = troubled(state, [found], is_good=False)
     assert [arrival.sequence for arrival in after.ids if arrival.is_good] == [1, 2, 3, 4, 5]
@@ -110,7 +110,7 @@ def test_at_a_worse_level_a_decision_advises_what_the_level_does() -> None:
     belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
     found = Decision("drift", "Records miss by more than stated", "chance", 20.0, since=6)
     for level in LEVELS:
-        state = State(belief, belief, health=Health(level))
+        state = State(belief, health=Health(level))
         event = decided(state, found, None, 16)
         worse = LEVELS.index(level) > LEVELS.index("watch")
         assert event["do"].startswith(LEVEL_ADVICE[level][:20] if worse else KINDS["drift"].do[:20])
