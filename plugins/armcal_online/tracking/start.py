@@ -204,13 +204,10 @@ def _freedoms(calibration: Calibration, names: Iterable[str]) -> dict[str, float
 
 
 def _drifts(calibration: Calibration, space: StateSpace) -> tuple[GaussMarkovState, ...]:
-    recording = calibration.uncertainty.record.recording
-    if recording is None:
-        return ()
     place = {name: i for i, name in enumerate(space.names)}
     return tuple(
         GaussMarkovState(f"drift of {name}", d.over, d.channel, place[name], d.sd / float(space.scales[place[name]]))
-        for name, d in recording.drifts.items()
+        for name, d in calibration.uncertainty.record.drifts.items()
     )
 
 
