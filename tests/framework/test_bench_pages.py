@@ -28,8 +28,8 @@ def folder(tmp_path: Path) -> Path:
 def shown(page: str, *commands: str) -> list[list[str]]:
     """The words of the block on a page that gives these commands of armcal, one after the other."""
     for block in blocks((ROOT / "docs" / page).read_text(encoding="utf-8")):
-        words = [shlex.split(line) for line in block.text.splitlines()]
-        if tuple(line[1] for line in words if line[:1] == ["armcal"]) == commands:
+        words = [shlex.split(line) for line in block.text.splitlines() if line.startswith("armcal ")]
+        if tuple(line[1] for line in words) == commands:
             return [line[1:] for line in words]
     raise AssertionError(f"{page} shows no {commands}")
 

@@ -144,7 +144,6 @@ def travel(path: Sequence[Array]) -> float:
     return float(sum(np.max(np.abs(b - a)) for a, b in pairwise(path)))
 
 
-_LONGEST_STEP = 2.0  # Periods: after a pause of the host, the arm goes on from where it is and does not catch up
 _ALIVE_EVERY_S = 0.1
 _NOTED_EVERY_S = 1.0
 _HEATED_EVERY_S = 0.25
@@ -258,7 +257,8 @@ class Drive:
             while gone < length:
                 moves = self.tick(may_move)
                 now = self.clock.now()
-                step = min(now - before, _LONGEST_STEP * self.settings.period) * self._rate
+                # After a pause of the host the arm goes on from where it is: a step that catches up is a jump.
+                step = min(now - before, self.settings.period) * self._rate
                 before = now
                 if not moves:
                     self.thermal_state.check()
