@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import math
 import shutil
 from pathlib import Path
@@ -64,7 +65,6 @@ def test_joints_that_turn_as_commanded_are_right_and_only_those_are_driven(tmp_p
     [
         (["elbow_flex.direction=-1"], "the other way. Give its direction in bench.device the other sign."),
         (["elbow_flex.id=4", "wrist_flex.id=3"], "Exchange their ids in bench.device, or their plugs."),
-        (["elbow_flex.horn_teeth=-1"], "elbow_flex stands +13"),
         (["shoulder_pan.horn_teeth=-1"], "servo says: 1 tooth of its horn (14.4 deg each) and a zero of +5."),
         (["elbow_flex={id: 2}"], "Two servos may have the id 2"),
     ],
@@ -75,6 +75,15 @@ def test_what_is_wrong_is_named_and_nothing_unsafe_is_done(tmp_path: Path, chang
     assert says in text
     assert offences == {}
     assert f"{changes[0].partition('.')[0].partition('=')[0]}" in unchecked(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_horn_that_is_a_tooth_off_is_found_within_its_deviation(tmp_path: Path) -> None:
+    code, text, offences = checked(tmp_path, f"{SERVO}elbow_flex.horn_teeth=-1")
+    stands = re.search(r"elbow_flex stands ([+-][\d.]+) \+- ([\d.]+) deg from where its servo says", text)
+    assert code != 0 and offences == {} and stands, text
+    assert abs(float(stands[1]) - 360 / 25) < float(stands[2]) < 360 / 25 / 2
+    assert "1 tooth of its horn (14.4 deg each)" in text and "elbow_flex" in unchecked(tmp_path)
 
 
 @pytest.mark.parametrize("sd_deg", [0.2, 1.0, 4.0, 8.0])
