@@ -73,7 +73,7 @@ def opencv() -> Any:
     Raises:
         PluginError: it is not installed, or too old to know boards of tags.
     """
-    cv2 = library("cv2", "looking at images")
+    cv2 = library("cv2", "a camera")
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
         version = getattr(cv2, "__version__", "of an unknown version")
         hint = "Run pip install --upgrade 'armcal[camera]'."
