@@ -190,8 +190,9 @@ class ServoWorld(BenchWorld):
                 if (fault.at or 0.0) >= self.now:
                     self.faults.plan({"at": 0.0, **fault.model_dump(exclude_unset=True)})
             except ValueError as refused:
-                hint = "docs/devices.md lists the faults."
-                raise ConfigError(f"bench.simulator.faults: {refused}.", hint=hint) from refused
+                hint = "Faults are listed in docs/devices.md."
+                text = f"bench.simulator.faults: {refused}".rstrip(".")
+                raise ConfigError(text if text.endswith("?") else f"{text}.", hint=hint) from refused
 
     def encoder_angle(self, joint: str) -> float:
         """The angle (rad) that the device reads of a joint's encoder."""
