@@ -203,7 +203,7 @@ def test_the_curve_has_every_error_and_the_truth(knowing: tuple[ErrorCurve, dict
 
 
 def test_the_figure_is_a_picture_of_fair_size(knowing: tuple[ErrorCurve, dict[str, Any]]) -> None:
-    picture = mission_figure(*knowing, 30)
+    picture = mission_figure(*knowing)
     assert picture.startswith(b"\x89PNG") and len(picture) > 20_000
     assert int.from_bytes(picture[16:20], "big") >= 1200
 
