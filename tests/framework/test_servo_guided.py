@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal.errors import InputError
+from armcal.errors import DataError, InputError
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.keys import QUIT, OperatorInput, servo_input
 from armcal_bench.servo.outputs import improved
@@ -23,6 +23,8 @@ from tests.servo_fakes import config_in, setup_on
 SERVO = "bench:\n  servo: {joints: [q1, q3], approach: 4 deg}\n"
 TRUE_US = {"q1": (604.0, 1533.0, 2491.0), "q3": (650.0, 1560.0, 2420.0)}
 KNOTS = (-100.0, 0.0, 100.0)
+STATED = {"board": "front", "channel": 0, "oscillator_hz": 25e6, "prescale": 121}
+STATED |= {"angles": [-1.0, 1.0], "pulses": [1e-3, 2e-3]}
 
 
 class Person:
@@ -218,3 +220,17 @@ def test_back_asks_again_and_the_later_answer_counts(tmp_path, monkeypatch):
     (first, again) = observed(tmp_path / "out")
     assert first[:3] == again[:3] and again[3] - first[3] == 4
     assert evaluated(setup, tmp_path / "out").servos["q1"].used == 1
+
+
+def test_an_entry_that_is_no_observation_is_refused_with_its_place(tmp_path):
+    with Record(tmp_path) as record:
+        record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
+        record.append("what", {})
+    with pytest.raises(DataError, match=r"journal.sqlite: entry 2: .*delete from entry where sequence = 2"):
+        Record(tmp_path)
+
+
+def test_observations_of_an_earlier_version_are_named(tmp_path):
+    (tmp_path / "observations.jsonl").write_text('{"kind": "begun"}\n')
+    with pytest.raises(InputError, match=r"a journal of an earlier version of armcal \(observations.jsonl\)"):
+        Record(tmp_path)

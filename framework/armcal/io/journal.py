@@ -24,6 +24,7 @@ from armcal.io.plain_files import make_folder
 
 JOURNAL = "journal.sqlite"
 _EARLIER = "journal"  # the folder of segments that versions before had in its place
+_EARLIER_LINES = "observations.jsonl"  # and what those of armcal servo had
 JOURNAL_FILES = (JOURNAL, *(f"{JOURNAL}{end}" for end in ("-wal", "-shm", "-journal", ".lock")), _EARLIER)
 """All that a journal may have in its folder."""
 TOTAL_BYTES = 64 << 20
@@ -336,9 +337,10 @@ def has_journal(folder: Path) -> bool:
     with suppress(OSError):
         if (folder / JOURNAL).is_file():
             return True
-        if segments := sorted((folder / _EARLIER).glob("journal-*.log")):
+        earlier = *sorted((folder / _EARLIER).glob("journal-*.log")), *folder.glob(_EARLIER_LINES)
+        if earlier:
             hint = "Go on with that version, or give a new --out (of a recalibration, begun from its calibration.yaml)."
-            text = f"it holds a journal of an earlier version of armcal ({_EARLIER}/{segments[0].name})."
+            text = f"it holds a journal of an earlier version of armcal ({earlier[0].relative_to(folder)})."
             raise InputError(text, where=Location(str(folder)), hint=hint)
     return False
 
