@@ -261,6 +261,7 @@ def _framed(sent: list[bags.Sent]) -> list[bags.Sent]:
         (_stamped(lambda i, t: 0.0), "have the stamp zero.*stamps: receive"),
         (_stamped(lambda i, t: bags.BEGIN_S), "have the stamp of the one before"),
         (_stamped(lambda i, t: t - (i % 2)), "have a stamp before that of an earlier one"),
+        (_stamped(lambda i, t: t + 1e6 * (i == 2)), "have a stamp before that of an earlier one.*stamps: receive"),
         (_with_positions(np.degrees), "more than one turn.*unit: deg"),
         (_with_positions(lambda q: q * np.nan), "finite position"),
         (_with_positions(lambda q: q[:3]), "finite position"),
@@ -322,6 +323,14 @@ def test_a_few_faulty_messages_are_counted(tour: bags.Tour, name: Path) -> None:
     require_rests(dataset, tour)
     text = " ".join(dataset.warnings)
     assert "3 of" in text and "not finite" in text and "without q3: left out" in text
+
+
+def test_a_clock_that_is_set_after_the_first_messages_costs_them_alone(tour: bags.Tour, name: Path) -> None:
+    sent = tour.sent()
+    for k in (0, 1, 2):
+        t, topic, kind, m = sent[k]
+        sent[k] = (t, topic, kind, bags.joint_state(t - 1e9, m.name, m.position))
+    require_rests(read(tour, bags.write_bag(name, sent)), tour)
 
 
 def test_two_programs_that_publish_the_joints_are_named(tour: bags.Tour, name: Path) -> None:
