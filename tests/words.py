@@ -18,7 +18,7 @@ NAMES = {
     "Eyes": "TrackerMonitor",
     "Looker": "MotionGate",
     "ParkWish": "ParkRequested",
-    "StaysLost": "DeviceLost",
+    "StaysLost": "ReconnectError",
     "TooHot": "ThermalLimit",
     "Warmth": "ThermalState",
     "take_up_play": "preload_backlash",

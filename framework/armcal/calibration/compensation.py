@@ -101,7 +101,7 @@ class Commands:
         joints: the commanded joints (n).
         joint_angles: what to command (N x n; rad, or m on sliding joints); of a target that cannot be reached, the
             nearest that was found.
-        counts: what a servo board is told (N x n; 0 of joints without a pulse table); None for an arm without one.
+        counts: of a servo board, to command (N x n; 0 of joints without a pulse table); None for an arm without one.
         base_T_tool: where the calibrated arm's tool then is (N x 4 x 4), quantisation and elasticity included.
         base_T_point: and the point that is brought to targets: the tool itself, or the target that was measured.
         distances: from that point to the target (N; m).
@@ -110,7 +110,7 @@ class Commands:
         reasons: why not; empty for those that are reached (N).
         bounds: no command brings the arm nearer than this (N; m); zero where nothing is known.
         moves: along a path, of each joint from the target before (N x n; rad or m); None for single targets.
-        approach: from where each joint comes (N x n; -1, 0, 1), as far as that was told or follows from the path.
+        approach: from where each joint comes (N x n; -1, 0, 1), as far as that was stated or follows from the path.
     """
 
     joints: tuple[str, ...]
@@ -312,7 +312,7 @@ def sides_of(moved: Array, before: Array) -> Array:
 def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array], Solutions]) -> Solutions:
     """Commands found under the sides from which they make the joints come; these are left in the record.
 
-    A joint that comes from the one side only if it is told to come from the other has no side: it gets 0, and its play
+    A joint that comes from the one side only if commanded from the other has no side: it gets 0, and its play
     counts as uncertainty.
 
     Args:

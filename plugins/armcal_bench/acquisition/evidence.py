@@ -122,7 +122,7 @@ class Evidence:
 
     Args:
         arrival: compares poses with the model's.
-        borne: whether a mistake of the tracker's frame ends no run; by default each does.
+        is_tolerated: whether the run goes on despite a mistake of the tracker's frame; by default it never does.
         fewest: poses that show one.
         restless_ends: whether poses in a row in which the arm does not come to stand end a run, whatever the reason.
 
@@ -133,13 +133,14 @@ class Evidence:
     def __init__(
         self,
         arrival: Arrival,
-        borne: Callable[[FrameMistake], bool] = lambda mistake: False,
+        is_tolerated: Callable[[FrameMistake], bool] = lambda mistake: False,
         fewest: int = FEWEST,
         *,
         restless_ends: bool = False,
     ) -> None:
         self.doubted: dict[int, Mapping[str, Any]] = {}
-        self.arrival, self._borne, self._fewest, self._restless_ends = arrival, borne, fewest, restless_ends
+        self.arrival, self._is_tolerated = arrival, is_tolerated
+        self._fewest, self._restless_ends = fewest, restless_ends
         self._stands: list[tuple[int, Stand]] = []
         self._failed = 0
 
@@ -189,5 +190,5 @@ class Evidence:
             FrameRefused: they are others.
         """
         mistake = self.mistake(measured)
-        if mistake is not None and not self._borne(mistake):
+        if mistake is not None and not self._is_tolerated(mistake):
             raise FrameRefused(f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came")

@@ -26,7 +26,7 @@ Torques = Callable[[Array], Array]  # Holding torques (joints, N m) at joint ang
 
 @dataclass(frozen=True)
 class HeatModel:
-    """All servos, by joint. Heat is a part of what a servo bears: 0 at rest for long, 1 at its limit.
+    """All servos, by joint. Heat is a fraction of a servo's limit: 0 at rest for long, 1 at its limit.
 
     What a servo loses goes with the square of its current, and the current with its torque. It warms the winding, which
     is quick, and the case, which is slow; each has a share of the heat and a time constant:

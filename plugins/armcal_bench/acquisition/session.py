@@ -67,7 +67,7 @@ _LAST_TRIES_S = 2.0  # Somebody who wants the end gets it as it should be, if th
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
 
 
-class DeviceLost(Exception):  # noqa: N818 - an ending, not an error of a caller
+class ReconnectError(Exception):
     """The device does not come back; the message says how long it was tried.
 
     Attributes:
@@ -101,7 +101,7 @@ class Recovery:
         """Do it; when the device fails, hold until it is open and restored, and do it again.
 
         Raises:
-            DeviceLost: it does not come back, or fails again at once, time after time.
+            ReconnectError: it does not come back, or fails again at once, time after time.
             DeviceUnwellError: it works, and the arm is to be parked.
         """
         while True:
@@ -120,12 +120,12 @@ class Recovery:
         began = clock.now()
         self._in_a_row, self._since = (self._in_a_row if began - self._since <= self._longest else 0) + 1, began
         if self._in_a_row > _MOST_IN_A_ROW:
-            raise DeviceLost(f"the device failed {self._in_a_row} times in a row ({fault})", fault)
+            raise ReconnectError(f"the device failed {self._in_a_row} times in a row ({fault})", fault)
         while (left := began + self._longest - clock.now()) > 0:
             why = f"the arm holds, the device is looked for: {fault.message.rstrip('.')}"
             waits.goes_on("device", why, left, clock.now())
             if self._gate.asked_to_end() and clock.now() >= began + _LAST_TRIES_S:
-                raise DeviceLost(f"it was asked to stop while the device was lost ({fault})", None)
+                raise ReconnectError(f"it was asked to stop while the device was lost ({fault})", None)
             clock.sleep(_AGAIN_EVERY_S)
             try:
                 reopened, begun = open_device(self._device, clock), self._identity
@@ -141,7 +141,7 @@ class Recovery:
             except DeviceError as again:
                 fault = again
         waits.given_up("device")
-        raise DeviceLost(f"the device did not come back in {self._longest:.0f} s ({fault})", fault)
+        raise ReconnectError(f"the device did not come back in {self._longest:.0f} s ({fault})", fault)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class AcquisitionRun:
                 if self._when_stopped == "hold" and self._gate.asked_to_end():
                     return self._hold_and_end(str(request))
                 return self._park_and_end("parked", str(request))
-            except DeviceLost as loss:
+            except ReconnectError as loss:
                 return self._end(Ending("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS))
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
@@ -383,7 +383,7 @@ class AcquisitionRun:
                 return self._end(Ending("held", f"{why}; no clear path to where it parks was found"))
             if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
                 self._persist(self._drive.release, lambda: None)
-        except (DeviceLost, DeviceUnwellError) as loss:
+        except (ReconnectError, DeviceUnwellError) as loss:
             return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}", _AS_IT_IS))
         return self._end(Ending(how, why))
 

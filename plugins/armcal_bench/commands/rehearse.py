@@ -24,7 +24,7 @@ _UNITS = {
     "speed": (_ANGLE, "deg/s"),
     "clearance": (1e3, "mm"),
     "pulse": (1e6, "us"),
-    "heat": (1e2, "% of what the servo bears"),
+    "heat": (1e2, "% of the servo's limit"),
     "energised_together": (1.0, "s apart"),
 }
 """Of the bench's own account: what its numbers are multiplied by, and the unit that they then have."""
@@ -45,7 +45,7 @@ def rehearse(
     resume: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Do what armcal acquire or armcal servo does, against the simulated bench of CONFIG, and say what its arm bore.
+    """Do what armcal acquire or armcal servo does, on the simulated bench of CONFIG; report the loads on its arm.
 
     The servo file stays as it is.
     """

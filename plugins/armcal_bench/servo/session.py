@@ -124,8 +124,8 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         joint = next((joint for joint, names in planned.items() if not over.issuperset(names)), setup.joints[-1])
         talk.report(joint, len(over.intersection(planned[joint])), len(planned[joint]))
 
-    def is_borne(mistake: FrameMistake) -> bool:
-        """A left-handed frame cannot be told from reversed servos, one by one."""
+    def is_tolerated(mistake: FrameMistake) -> bool:
+        """A left-handed frame cannot be distinguished from reversed servos, one by one."""
         return 1 / _FAR_GAIN < mistake.frame.gain < _FAR_GAIN
 
     def check(identity: DeviceIdentity) -> None:
@@ -138,7 +138,7 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         return
     prepared, options = setup.run(device, poses), talk.options(report)
     with opened(prepared, options, clock, check) as (gate, identity):
-        evidence = Evidence(prepared.arrival, is_borne, restless_ends=True)
+        evidence = Evidence(prepared.arrival, is_tolerated, restless_ends=True)
         run = ready_run(prepared, options, log, gate, identity, evidence)
         begin(setup, record, identity)
         ending = run.run()
