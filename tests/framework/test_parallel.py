@@ -355,3 +355,18 @@ def test_no_process_executes_a_file_of_the_working_directory(hostile: Path, comm
     done = subprocess.run([start, *command], cwd=hostile, capture_output=True, text=True, timeout=500, check=False)
     assert [path.name for path in hostile.parent.glob("executed-*")] == []
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_ctrl_c_as_the_pool_starts_is_an_interrupt_and_no_fault_of_the_library(monkeypatch) -> None:
+    """Loky, interrupted before its thread runs, fails to join it."""
+
+    def interrupted(self, tasks):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            yield from map(time.sleep, [5.0])
+        except KeyboardInterrupt:
+            raise RuntimeError("cannot join thread before it is started") from None
+
+    monkeypatch.setattr("joblib.Parallel.__call__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Workers("threading", 2).map(abs, [1, 2])

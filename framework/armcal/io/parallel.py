@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from armcal.errors import ArmcalError, InputError, Location
+from armcal.io.signals import Interrupts
 from armcal.plugins import blaming
 
 T = TypeVar("T")
@@ -101,7 +102,7 @@ class Workers:
             )
         results: list[R] = []
         try:
-            with self._configured():
+            with self._configured(), Interrupts() as interrupts:
                 report(0.0)
                 # One at a time: a batch might hold all the long ones.
                 at_work = joblib.Parallel(return_as="generator", batch_size=1)
@@ -111,6 +112,10 @@ class Workers:
         except BrokenProcessPool as fault:
             text = f"a worker process ended without an answer ({str(fault).splitlines()[0]})"
             raise ArmcalError(text, where=_OPTION, hint="If memory was short, take fewer processes.") from fault
+        except RuntimeError as fault:  # of loky, which is interrupted as it starts, and cannot end what has not begun
+            if interrupts.came:
+                raise KeyboardInterrupt from fault
+            raise
         return results
 
     @contextmanager
