@@ -32,7 +32,7 @@ from armcal_urdf.robot import (
     read_text,
 )
 
-_UNFIT = re.compile(r"[^\w-]")
+_UNFIT = re.compile(r"[^A-Za-z0-9_-]")
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,9 @@ def frame_names(links: list[str]) -> Mapping[str, str]:
 
 
 def _fitting(kind: str, names: list[str]) -> Mapping[str, str]:
-    """Names with only letters, digits, _ and -: parameters, channels and globs use the rest."""
-    return _different(kind, {name: _UNFIT.sub("_", name) for name in names})
+    """Names with a letter first and only letters, digits, _ and -: parameters, channels and globs use the rest."""
+    fitting = {name: _UNFIT.sub("_", name) for name in names}
+    return _different(kind, {name: own if own[0].isalpha() else f"{kind}_{own}" for name, own in fitting.items()})
 
 
 def _different(kind: str, fitting: Mapping[str, str]) -> Mapping[str, str]:
@@ -261,6 +262,15 @@ class UrdfSettings(Settings):
             object.__setattr__(self, name, value)
         chain_of(robot, self.root, self.tip)
         return self
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is ignored in the URDF, and which of its joints have another name here."""
+        robot = self.robot
+        ignored = [f"ignored: {', '.join(robot.ignored)}"] if robot.ignored else []
+        joints = chain_of(robot, self.root, self.tip).moving
+        renamed = [f"{joint.urdf.name} is {joint.name}" for joint in joints if joint.name != joint.urdf.name]
+        return (*ignored, *([f"joints are named so that columns can be: {', '.join(renamed)}"] if renamed else []))
 
     def to_config(self) -> dict[str, Any]:
         return {name: value for name, value in super().to_config().items() if name != "path"}

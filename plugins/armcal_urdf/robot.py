@@ -122,6 +122,7 @@ Three = tuple[float, float, float]
 LARGEST = 1e6  # m, rad or kg: no arm is that far off, and sums with larger numbers lose the micrometres
 SHORTEST_AXIS = 1e-9
 _WHITE = re.compile(r"[ \t\r\n]+")
+_PROPERTY = "xacro:property"  # which nothing uses where there is no ${...}
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -179,7 +180,7 @@ def read_elements(text: str, label: str) -> Element:
         hint = "Delete it."
         raise ConfigError("found half a surrogate pair.", where=Location(label or None, line), hint=hint) from fault
     parser = expat.ParserCreate(UTF8)
-    builder = _Builder(parser, label)
+    builder = _Builder(parser, label, is_expanded="${" not in text)
     try:
         parser.Parse(data, True)
     except expat.ExpatError as fault:
@@ -194,9 +195,9 @@ def read_elements(text: str, label: str) -> Element:
 class _Builder:
     """Builds elements out of the parser's events."""
 
-    def __init__(self, parser: expat.XMLParserType, label: str) -> None:
+    def __init__(self, parser: expat.XMLParserType, label: str, is_expanded: bool) -> None:
         self.root: list[Element] = []
-        self._parser, self._label = parser, label
+        self._parser, self._label, self._is_expanded = parser, label, is_expanded
         self._open: list[Element] = []
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
@@ -205,7 +206,7 @@ class _Builder:
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         line, start = self._parser.CurrentLineNumber, self._parser.CurrentByteIndex
         element = Element(tag, attributes, line, start, self._label)
-        if tag.startswith("xacro:"):
+        if tag.startswith("xacro:") and not (tag == _PROPERTY and self._is_expanded):
             element.refuse(f"found <{tag}>: this is xacro, not yet a URDF.", "Run it through xacro first.")
         if len(self._open) >= MAX_DEPTH:
             element.refuse(f"elements are nested deeper than {MAX_DEPTH} levels.", "A URDF needs five.")
@@ -341,6 +342,7 @@ class Robot:
 
     links: Mapping[str, UrdfLink]
     joints: Mapping[str, UrdfJoint]
+    ignored: tuple[str, ...] = ()  # what other programs read, and a property of xacro that nothing uses
 
     @cached_property
     def above(self) -> Mapping[str, UrdfJoint]:
@@ -400,9 +402,19 @@ def read_robot(text: str, label: str) -> Robot:
         _refuse_second(element, joints.setdefault(joint.name, joint))
     if not links:
         top.refuse("found no <link> in <robot>, expected links and joints.", "Give a whole URDF.")
-    robot = Robot(links, joints)
+    robot = Robot(links, joints, tuple(dict.fromkeys(_ignored(top))))
     _require_tree(robot, top)
     return robot
+
+
+def _ignored(top: Element) -> Iterator[str]:
+    for element in top.children:
+        if element.tag == _PROPERTY:
+            yield f"<{_PROPERTY}>"
+        for inner in (element, *element.children):
+            yield from sorted(set(inner.attributes) - _plain(inner))
+            if inner.tag == "axis" and "rpy" in inner.attributes:
+                yield "rpy of <axis>"
 
 
 def _refuse_second(element: Element, first: UrdfLink | UrdfJoint) -> None:
@@ -445,7 +457,7 @@ def _joint(element: Element) -> UrdfJoint:
         child=_named_link(element, "child", name),
         xyz=three(origin, "xyz"),
         rpy=three(origin, "rpy"),
-        axis=unit_axis(_only(element.one("axis"), ("xyz",))) if kind in MOVING else (1.0, 0.0, 0.0),
+        axis=unit_axis(_only(element.one("axis"), _ORIGIN)) if kind in MOVING else (1.0, 0.0, 0.0),
         limits=_limits(element.one("limit"), name) if kind in ("revolute", "prismatic") else None,
         mimic=mimic,
         element=element,
@@ -463,7 +475,7 @@ def _limits(element: Element | None, joint: str) -> tuple[float, float] | None:
     """Where only one end is written the other is 0, by the format; where neither is, nothing is known."""
     if element is None:
         return None
-    for attribute in element.attributes:
+    for attribute in _plain(element):
         _refuse_alike(element, f"the attribute {attribute!r}", attribute, _LIMIT)
     if not {"lower", "upper"} & set(element.attributes):
         return None
@@ -477,10 +489,15 @@ def _limits(element: Element | None, joint: str) -> tuple[float, float] | None:
 
 def _only(element: Element | None, known: tuple[str, ...]) -> Element | None:
     """An element without attributes beside the known ones: what it means by others would be passed over."""
-    unknown = sorted(set(element.attributes) - set(known)) if element else []
+    unknown = sorted(_plain(element) - set(known)) if element else []
     if element is not None and unknown:
         element.refuse(f"found the attribute {unknown[0]!r} in <{element.tag}>.", f"Write {' and '.join(known)}.")
     return element
+
+
+def _plain(element: Element) -> set[str]:
+    """Its attributes without those of other programs' namespaces, such as ``drake:acceleration``."""
+    return {name for name in element.attributes if ":" not in name}
 
 
 def _refuse_misspelt(element: Element, known: tuple[str, ...]) -> None:

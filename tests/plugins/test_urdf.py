@@ -355,6 +355,25 @@ def test_names_that_do_not_fit_are_made_to_fit_and_collisions_refused():
         settings(ODD.replace('"bend"', '"turn*1"').replace('"turn"', '"turn.1"'))
 
 
+def test_what_other_programs_read_is_ignored_and_said():
+    pin = pytest.importorskip("pinocchio")
+    text = ODD.replace(
+        '<robot name="odd">', '<robot name="odd" xmlns:drake="d">\n<xacro:property name="w" value=".2"/>'
+    )
+    text = text.replace('<axis xyz="0 3 4"/>', '<axis xyz="0 3 4" rpy="0 0 0"/>')
+    text = text.replace('upper="0.2"', 'upper="0.2" drake:acceleration="5"').replace('"turn"', '"1"')
+    model = UrdfModel(settings(text))
+    assert model.settings.notes[0] == "ignored: <xacro:property>, rpy of <axis>, drake:acceleration"
+    assert model.settings.notes[1] == "joints are named so that columns can be: 1 is joint_1"
+    found = frames_of(arm_of(text))([0.3, 0.7, 0.05])
+    arm = Arm("arm", "urdf", model, {}, ())
+    displacements = {"1" if name == "joint_1" else name: q for name, q in told(arm, [0.3, 0.7, 0.05]).items()}
+    expected = Oracle(pin, text.replace(' xmlns:drake="d"', "")).poses(displacements, ["tool"], "world")
+    np.testing.assert_allclose(found[""], expected["tool"], rtol=0, atol=EXACT_M)
+    with pytest.raises(ConfigError, match="this is xacro, not yet a URDF"):
+        settings(text.replace('"0 0 0.4"', '"0 0 ${w}"'))
+
+
 def test_the_tip_must_be_said_where_the_tree_ends_in_several():
     with pytest.raises(ValidationError, match="the tree ends in 2 links, lens, tool; say which is the tip"):
         UrdfSettings.model_validate({"text": ODD})

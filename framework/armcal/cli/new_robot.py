@@ -70,6 +70,8 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     console.line(f"{robot.name}: {len(robot.joints)} joints, {len(choice.deviations)} free parameters, in {folder}")
     if robot.name in SKELETONS and not (source.dh or source.urdf):
         console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
+    for note in robot.notes:
+        console.line(f"{source.urdf}: {note}")
     assumed = [joint.name for joint in robot.joints if joint.assumed]
     if assumed:
         console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")

@@ -83,6 +83,7 @@ class Robot:
     urdf: bytes = b""
     urdf_file: str = ""
     tip: str = ""  # the link that is the tool
+    notes: tuple[str, ...] = ()  # what is ignored in the URDF, and which joints have another name here
     up: tuple[float, float, float] | None = None  # in the tracker's base frame (unit vector); None if not stated
     target: tuple[float, float, float] | None = None  # the tracker's, in the tool's frame (m); None if not stated
 
@@ -257,6 +258,7 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
         urdf=path.read_bytes(),
         urdf_file=f"{name}.urdf",
         tip=model.settings.tip,
+        notes=model.settings.notes,
     )
 
 
