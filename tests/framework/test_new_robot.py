@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import yaml
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.convert import difference, load_source
+from armcal.calibration.convert import difference, load_source, nominal_values
+from armcal.calibration.rigid_chain import numeric_chain, tool_poses
 from armcal.cli.main import cli
 from armcal.cli.new_robot import direction, place
 from armcal.errors import InputError
@@ -25,6 +26,7 @@ from armcal.scaffold.robot import RobotJoint, Row, read_rows, robot_of_rows, rob
 from armcal.scaffold.robot_files import RECORDS, SIMULATED, _levels, write_robot
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
+from scipy.spatial.transform import Rotation
 
 HEADER = "alpha_deg,a_mm,theta_deg,d_mm"
 NOISE_MM = 0.1596  # mean length of three coordinates of 0.1 mm
@@ -177,6 +179,55 @@ def test_a_tilt_is_put_between_parallel_axes_only(convention: str, marked: list[
     rows = tuple(Row(joint, alpha, 0.1, 0, 0) for joint, alpha in zip(joints, alphas, strict=True))
     found = robot_of_rows("r", convention, rows)  # type: ignore[arg-type]
     assert [row.tilts for row in found.rows] == marked
+
+
+@pytest.mark.parametrize("convention", ["standard", "craig"])
+def test_fixed_rows_are_the_base_and_the_tool(convention: str, here: Path) -> None:
+    """Against the product of all rows, the fixed ones too."""
+    cells = [[20, 30, -40, 50], [90, 0, 10, 120], [-70, 200, 5, -11.8], [15, 12, 35, 7]]
+    lines = [",".join(map(str, row)) + kind for row, kind in zip(cells, [",fixed", ",", ",", ",Fixed"], strict=True)]
+    rows = read_rows(here / table(here, "\n".join([f"{HEADER},type", *lines])), REGISTRY)
+    robot = robot_of_rows("r", convention, rows)  # type: ignore[arg-type]
+    assert [joint.name for joint in robot.joints] == ["q1", "q2"]
+    write_robot(robot, here / "r", REGISTRY)
+    stated = yaml.safe_load((here / "r" / "arm.yaml").read_text(encoding="utf-8"))["arms"]["arm"]["model"]
+    made = REGISTRY.find("model", stated.pop("type")).load()
+    model = made(made.Settings.model_validate(stated))
+    found = tool_poses(numeric_chain(model, nominal_values(model)), np.array([[0.3, -0.8]]))[0]
+    expected = np.eye(4)
+    for (alpha, a, theta, d), turned in zip(cells, (0.0, 0.3, -0.8, 0.0), strict=True):
+        about_x, about_z = rotated("x", math.radians(alpha)), rotated("z", math.radians(theta) + turned)
+        about_x[0, 3], about_z[2, 3] = a / 1000, d / 1000
+        expected = expected @ (about_z @ about_x if convention == "standard" else about_x @ about_z)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def rotated(axis: str, angle: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
+    return pose
+
+
+def test_hayatis_beta_is_a_step_behind_the_row(here: Path) -> None:
+    rows = read_rows(here / table(here, f"{HEADER},beta_deg\n0,200,0,0,0.4\n90,1,2,3,0\n0,1,2,3,\n"), REGISTRY)
+    robot = robot_of_rows("r", "standard", rows)
+    assert [row.beta for row in robot.rows] == pytest.approx([math.radians(0.4), 0, 0]) and robot.rows[0].tilts
+    write_robot(robot, here / "r", REGISTRY)
+    assert "after: [{ry_deg: 0.4}]" in (here / "r" / "arm.yaml").read_text(encoding="utf-8")
+    with pytest.raises(InputError, match=r"found beta in a table of the modified convention.* as before: or after:"):
+        robot_of_rows("r", "craig", rows)
+
+
+def test_axes_that_a_maker_calibrated_give_the_freedoms_of_parallel_ones(here: Path) -> None:
+    drawn, calibrated = [], []
+    for folder, off in (("drawn", 0.0), ("calibrated", 0.17)):
+        text = f"{HEADER}\n0,0,0,120\n90,0,90,0\n{180 + off},400,0,0\n{180 - off},300,0,100\n90,0,0,90\n-90,0,0,80\n"
+        robot = robot_of_rows("r", "craig", read_rows(here / table(here, text), REGISTRY))
+        kept = write_robot(robot, here / folder, REGISTRY).kept
+        (drawn if off == 0 else calibrated).extend(kept)
+    assert len(drawn) == len(calibrated)
+    assert {name for name in drawn if name.endswith("_ry")} == {name for name in calibrated if name.endswith("_ry")}
+    assert "arm.mdh.before4_ry" in drawn
 
 
 def row_of(name: str) -> Row:
@@ -443,6 +494,15 @@ TABLES = {
     "limits of the other kind": (
         f"{HEADER},type,lower_deg,upper_deg\n0,1,2,3,prismatic,0,9\n",
         ":2, lower angle: found a limit of angle, and the joint slides. Write them under lower_m or",
+    ),
+    "a fixed row between joints": (
+        f"{HEADER},type\n0,1,2,3,\n0,1,2,3,fixed\n0,1,2,3,\n",
+        ":3: q2 is fixed and stands between joints.",
+    ),
+    "a mass in a fixed row": (f"{HEADER},type,mass_g\n0,1,2,3,fixed,4\n", ":2, mass: found a mass in a fixed row"),
+    "nearly parallel axes": (
+        f"{HEADER}\n-0.042,-57,0,574241\n0.19,1,2,-507363\n",
+        "Nearly parallel axes (alpha -0.042 deg) make d so long. Write the rows in an arm.yaml, and shorten them:",
     ),
     "an unknown type": (f"{HEADER},type\n0,1,2,3,ball\n", ":2, type: found 'ball'"),
     "a mass below zero": (f"{HEADER},mass_g\n0,1,2,3,-1\n", ":2, mass: found a mass below zero"),

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import PLACEMENT, MassiveModel
 from armcal.arm.model import Joint
@@ -28,6 +30,7 @@ from armcal.scaffold.plugin_files import check_length
 Convention = Literal["standard", "craig"]
 Range = tuple[float, float]
 Unit = Literal["mm", "deg"]
+Steps = tuple[tuple[str, float], ...]  # in turn: along x, y, z (m), then about x, y, z (rad)
 
 FEWEST_JOINTS, MOST_JOINTS = 2, 20
 ASSUMED_TURN: Range = (-math.radians(120), math.radians(120))  # limits of joints of which none are stated
@@ -35,6 +38,7 @@ ASSUMED_TRAVEL: Range = (0.0, 0.2)
 MOST = {"angle": 4 * math.pi, "length": 100.0, "mass": 1e5}  # beyond it (rad, m, kg) a number is in another unit
 WIDTHS: Mapping[Unit, float] = {"mm": 10.0, "deg": 2.0}
 _PARALLEL = 0.02
+_NO_STEPS: Steps = tuple((name, 0.0) for name in ("x", "y", "z", "rx", "ry", "rz"))
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,20 @@ class Row:
     theta: float
     d: float
     mass: Mass | None = None
+    beta: float = 0.0  # about y, after the row [Hayati1983]
     tilts: bool = False  # whether its axis and the one that ``alpha`` leads to are parallel: ``ry`` then tilts them
+    is_fixed: bool = False  # no joint turns or slides it: a step of the base or of the tool
+
+    def steps(self, convention: Convention) -> Steps:
+        """Where it leads to."""
+        about_x, along_x = Rotation.from_euler("x", self.alpha), np.array([self.a, 0.0, 0.0])
+        about_z, along_z = Rotation.from_euler("z", self.theta), np.array([0.0, 0.0, self.d])
+        if convention == "standard":
+            turn, place = about_z * about_x * Rotation.from_euler("y", self.beta), about_z.apply(along_z + along_x)
+        else:
+            turn, place = about_x * about_z, along_x + about_x.apply(along_z)
+        angles = turn.as_euler("XYZ")
+        return tuple(zip(("x", "y", "z", "rx", "ry", "rz"), [*place.tolist(), *angles.tolist()], strict=True))
 
 
 @dataclass(frozen=True)
@@ -79,7 +96,9 @@ class Robot:
     priors: Mapping[str, Unit] = field(default_factory=dict)  # globs of parameters that have one; units of the widths
     widths: Mapping[Unit, float] = field(default_factory=lambda: WIDTHS)  # how far these may be off (sd)
     convention: Convention = "standard"
-    rows: tuple[Row, ...] = ()  # empty for a URDF
+    rows: tuple[Row, ...] = ()  # of joints; empty for a URDF
+    base: Steps = _NO_STEPS  # of a table that begins with a fixed row
+    tool: Steps = ()  # of one that ends with a fixed row
     urdf: bytes = b""
     urdf_file: str = ""
     tip: str = ""  # the link that is the tool
@@ -101,8 +120,15 @@ def robot_of_rows(name: str, convention: Convention, rows: tuple[Row, ...]) -> R
         both = 0 <= other < len(rows) and rows[index].joint.turns and rows[other].joint.turns
         return both and abs(math.sin(rows[index].alpha)) < _PARALLEL
 
-    rows = tuple(replace(row, tilts=is_parallel(index)) for index, row in enumerate(rows))
-    of_rows = (("arm.mdh.theta*",), ("arm.mdh.a[0-9]*", "arm.mdh.d[0-9]*"), ("arm.mdh.alpha*", "arm.mdh.*_ry"))
+    if convention != "standard" and any(row.beta for row in rows):
+        text = "found beta in a table of the modified convention, in which authors differ on its place."
+        raise ConfigError(text, hint="Leave the column out, and write it as before: or after: of a row in arm.yaml.")
+    base = rows[0].steps(convention) if rows[0].is_fixed else _NO_STEPS
+    tool = rows[-1].steps(convention) if rows[-1].is_fixed else ()
+    rows = tuple(row for row in rows if not row.is_fixed)
+    rows = tuple(replace(row, tilts=bool(row.beta) or is_parallel(index)) for index, row in enumerate(rows))
+    # Between axes that are parallel but for a maker's calibration, d would stand for the tilt, over many metres.
+    of_rows = (("arm.mdh.theta*",), ("arm.mdh.*_ry",), ("arm.mdh.a[0-9]*", "arm.mdh.d[0-9]*"), ("arm.mdh.alpha*",))
     priors: dict[str, Unit] = dict.fromkeys(("arm.mdh.theta*", "arm.mdh.alpha*"), "deg")
     priors |= dict.fromkeys(("arm.mdh.after*_ry", "arm.mdh.before*_ry"), "deg")
     priors |= dict.fromkeys(("arm.mdh.a[0-9]*", "arm.mdh.d[0-9]*"), "mm")
@@ -114,6 +140,8 @@ def robot_of_rows(name: str, convention: Convention, rows: tuple[Row, ...]) -> R
         priors=priors,
         convention=convention,
         rows=rows,
+        base=base,
+        tool=tool,
     )
 
 
@@ -148,7 +176,7 @@ def check_joint_names(names: Sequence[str], places: Sequence[Location]) -> None:
 
 
 _NUMBERS = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length"}
-_OPTIONAL = {"mass": "mass", "com_x": "length", "com_y": "length", "com_z": "length"}
+_OPTIONAL = {"beta": "angle", "mass": "mass", "com_x": "length", "com_y": "length", "com_z": "length"}
 _LIMITS = {f"{which} {dimension}": dimension for dimension in ("angle", "length") for which in ("lower", "upper")}
 _CHANNELS = {
     name: RequestedChannel(
@@ -157,7 +185,7 @@ _CHANNELS = {
     for name, dimension in (_NUMBERS | _OPTIONAL | _LIMITS).items()
 }
 _TEXTS = ("name", "joint", "type")
-_KINDS = {"": True, "revolute": True, "prismatic": False}
+_KINDS = {"": True, "revolute": True, "prismatic": False, "fixed": True}
 
 
 def read_rows(path: Path, registry: PluginRegistry) -> tuple[Row, ...]:
@@ -176,13 +204,21 @@ def read_rows(path: Path, registry: PluginRegistry) -> tuple[Row, ...]:
             hint = f"Did you mean {near[0]}?" if near else layout
             raise DataError(text, where=Location(str(path), field=column[:60]), hint=hint)
     rows = tuple(_row(table, index) for index in range(len(table)))
-    if not FEWEST_JOINTS <= len(table) <= MOST_JOINTS:
+    for line, row in zip(table.rows[1:-1], rows[1:-1], strict=True):
+        if row.is_fixed:
+            text = f"{row.joint.name} is fixed and stands between joints."
+            hint = "Only the first and the last row may be fixed: give a URDF, or rows whose frames stand at joints."
+            raise DataError(text, where=Location(str(path), line=line), hint=hint)
+    joints = sum(not row.is_fixed for row in rows)
+    if not FEWEST_JOINTS <= joints <= MOST_JOINTS:
         raise DataError(
-            f"found {plural(len(table), 'joint')}, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
+            f"found {plural(joints, 'joint')}, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
             where=Location(str(path), line=table.rows[-1]),
             hint="Give one line a joint, from the base to the tip.",
         )
-    check_joint_names([row.joint.name for row in rows], [Location(str(path), line=line) for line in table.rows])
+    places = [Location(str(path), line=line) for line in table.rows]
+    moving = [(row.joint.name, place) for row, place in zip(rows, places, strict=True) if not row.is_fixed]
+    check_joint_names(*zip(*moving, strict=True))
     return rows
 
 
@@ -196,13 +232,19 @@ def _row(table: Dataset, index: int) -> Row:
         if abs(value) > MOST[dimension]:
             unit = display_unit(dimension).name
             text = f"found {to_unit(value, unit):g} {unit}, expected an arm's {dimension}."
-            raise refused(name, text, "Check the column's unit.")
+            hint = "Check the column's unit."
+            alphas = table.channels["alpha"][max(index - 1, 0) : index + 1]
+            parallel = [f"{math.degrees(alpha):.3g}" for alpha in alphas if abs(math.sin(alpha)) < _PARALLEL]
+            if name == "d" and parallel:
+                hint = f"Nearly parallel axes (alpha {', '.join(parallel)} deg) make d so long. Write the rows in an "
+                hint += "arm.yaml, and shorten them: armcal convert arm.yaml --to mdh."
+            raise refused(name, text, hint)
         if not math.isnan(value):
             numbers[name] = value
     kind, given = (table.extra[name][index].strip() if name in table.extra else "" for name in ("type", "name"))
     given = given or (table.extra["joint"][index].strip() if "joint" in table.extra else "")
     if kind.lower() not in _KINDS:
-        raise refused("type", f"found {kind!r}, expected revolute or prismatic.", "Leave it empty for revolute.")
+        raise refused("type", f"found {kind!r}, expected revolute, prismatic or fixed.", "Leave it empty for revolute.")
     turns = _KINDS[kind.lower()]
     own, moves = ("angle", "turns") if turns else ("length", "slides")
     low, high = (numbers.get(f"{which} {own}") for which in ("lower", "upper"))
@@ -221,9 +263,14 @@ def _row(table: Dataset, index: int) -> Row:
     mass = None
     if numbers.get("mass"):
         mass = Mass(numbers["mass"], (numbers.get("com_x", 0.0), numbers.get("com_y", 0.0), numbers.get("com_z", 0.0)))
-    name = f"q{given or index + 1}" if not given or given.isdecimal() else given
+    fixed = kind.lower() == "fixed"
+    if fixed and mass:
+        raise refused("mass", "found a mass in a fixed row.", "Write it in links: of arm.yaml, with its frame.")
+    before = sum(text.strip().lower() == "fixed" for text in table.extra.get("type", ())[:index])
+    name = f"q{given or index - before + 1}" if not given or given.isdecimal() else given
     joint = RobotJoint(name, turns, limits, assumed=low is None)
-    return Row(joint, numbers["alpha"], numbers["a"], numbers["theta"], numbers["d"], mass)
+    values = (numbers[channel] for channel in _NUMBERS)
+    return Row(joint, *values, mass, numbers.get("beta", 0.0), is_fixed=fixed)
 
 
 _MOST_TRAVEL_RAD = 3.2  # a turning joint need not be measured over more than one turn

@@ -29,7 +29,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from armcal.run.result import RunResult
 from armcal.scaffold.plugin_files import number, rendered, staged, write_texts
-from armcal.scaffold.robot import Robot, RobotJoint, Unit
+from armcal.scaffold.robot import Robot, RobotJoint, Steps, Unit
 
 MOST_UNCERTAIN = 0.5  # in typical scales: what the declared noise leaves less certain is fixed
 SIMULATED, RECORDS = "simulated.yaml", "simulated.csv"
@@ -131,6 +131,7 @@ def _write(place: Path, robot: Robot, choice: MinimalSet, true: Mapping[str, str
         "seed": NOISE_SEED,
         "shown": _shown,
         "levels": _levels,
+        "steps": _steps,
         "turning": [joint for joint in robot.joints if joint.turns],
         "sliding": [joint for joint in robot.joints if not joint.turns],
         "assumed": [joint.name for joint in robot.joints if joint.assumed],
@@ -140,6 +141,11 @@ def _write(place: Path, robot: Robot, choice: MinimalSet, true: Mapping[str, str
 
 def _shown(value: float, dimension: str) -> str:
     return number(to_unit(value, display_unit(dimension).name))
+
+
+def _steps(steps: Steps) -> str:
+    units = {name: ("angle", "deg") if len(name) == 2 else ("length", "mm") for name, _ in steps}
+    return ", ".join(f"{{{name}_{units[name][1]}: {_shown(value, units[name][0])}}}" for name, value in steps)
 
 
 def _levels(joint: RobotJoint) -> list[str]:
