@@ -204,20 +204,19 @@ def read_rows(path: Path, registry: PluginRegistry) -> tuple[Row, ...]:
             hint = f"Did you mean {near[0]}?" if near else layout
             raise DataError(text, where=Location(str(path), field=column[:60]), hint=hint)
     rows = tuple(_row(table, index) for index in range(len(table)))
-    for line, row in zip(table.rows[1:-1], rows[1:-1], strict=True):
-        if row.is_fixed:
-            text = f"{row.joint.name} is fixed and stands between joints."
+    places = [Location(str(path), line=line) for line in table.rows]
+    moving = [(row.joint.name, place) for row, place in zip(rows, places, strict=True) if not row.is_fixed]
+    for between, place in zip(rows[1:-1], places[1:-1], strict=True):
+        if between.is_fixed:
+            text = f"{between.joint.name} is fixed and stands between joints."
             hint = "Only the first and the last row may be fixed: give a URDF, or rows whose frames stand at joints."
-            raise DataError(text, where=Location(str(path), line=line), hint=hint)
-    joints = sum(not row.is_fixed for row in rows)
-    if not FEWEST_JOINTS <= joints <= MOST_JOINTS:
+            raise DataError(text, where=place, hint=hint)
+    if not FEWEST_JOINTS <= len(moving) <= MOST_JOINTS:
         raise DataError(
-            f"found {plural(joints, 'joint')}, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
+            f"found {plural(len(moving), 'joint')}, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
             where=Location(str(path), line=table.rows[-1]),
             hint="Give one line a joint, from the base to the tip.",
         )
-    places = [Location(str(path), line=line) for line in table.rows]
-    moving = [(row.joint.name, place) for row, place in zip(rows, places, strict=True) if not row.is_fixed]
     check_joint_names(*zip(*moving, strict=True))
     return rows
 
@@ -269,8 +268,8 @@ def _row(table: Dataset, index: int) -> Row:
     before = sum(text.strip().lower() == "fixed" for text in table.extra.get("type", ())[:index])
     name = f"q{given or index - before + 1}" if not given or given.isdecimal() else given
     joint = RobotJoint(name, turns, limits, assumed=low is None)
-    values = (numbers[channel] for channel in _NUMBERS)
-    return Row(joint, *values, mass, numbers.get("beta", 0.0), is_fixed=fixed)
+    alpha, a, theta, d = (numbers[channel] for channel in _NUMBERS)
+    return Row(joint, alpha, a, theta, d, mass, numbers.get("beta", 0.0), is_fixed=fixed)
 
 
 _MOST_TRAVEL_RAD = 3.2  # a turning joint need not be measured over more than one turn
