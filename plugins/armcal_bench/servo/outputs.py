@@ -3,25 +3,21 @@
 import errno
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
 from armcal.arm.servo import PulseTable
 from armcal.base.config_text import finite
-from armcal.base.units import split_suffix
 from armcal.config.servo_file import (
     BoardSettings,
     ServoFile,
     ServoSettings,
-    board_fields,
     load_servo_file,
-    servo_fields,
     servo_file_text,
 )
-from armcal.errors import ConfigError
 from armcal.io.plain_files import write_whole, writing
 
 from armcal_bench.servo.record import next_name
@@ -117,85 +113,6 @@ def _of_springs(outcome: Outcome) -> list[str]:
     ]
 
 
-Edit = tuple[int, int, str]  # The characters from here to there become this
-
-
-def edited_text(text: str, before: ServoFile, after: ServoFile) -> str | None:
-    """A servo file's text with the numbers of ``after`` in place of those of ``before``.
-
-    None where it has no such place: a part stands in another file that this one extends, or is written by an alias (an
-    anchor's text would change all that refer to it).
-    """
-    try:
-        if any(isinstance(token, yaml.AliasToken | yaml.AnchorToken) for token in yaml.scan(text)):
-            return None
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        edits = [*_of_parts(root, "boards", before, after), *_of_parts(root, "servos", before, after)]
-    except (yaml.YAMLError, LookupError):
-        return None
-    for start, end, new in sorted(edits, reverse=True):
-        text = text[:start] + new + text[end:]
-    return text
-
-
-def _of_parts(root: yaml.Node | None, section: str, before: ServoFile, after: ServoFile) -> Iterator[Edit]:
-    parts = _value(root, section)
-    for name, part in getattr(after, section).items():
-        if part != getattr(before, section)[name]:
-            yield from _of_part(_value(parts, name), getattr(before, section)[name], part)
-
-
-def _of_part(
-    node: yaml.Node, before: BoardSettings | ServoSettings, after: BoardSettings | ServoSettings
-) -> Iterator[Edit]:
-    """Every field that changed: its value anew, or key and value where the unit changes or it was not there."""
-    was, now = _fields(before), _fields(after)
-    for field, (key, text) in now.items():
-        if was.get(field) == (key, text):
-            continue
-        try:
-            name, value = _entry(node, field)
-        except LookupError:
-            end, indent = _end(node.value[-1][1]), " " * node.value[0][0].start_mark.column
-            yield end, end, f", {key}: {text}" if _is_flow(node) else f"\n{indent}{key}: {text}"
-            continue
-        yield name.start_mark.index, _end(value), f"{key}: {text}"
-
-
-def _fields(part: BoardSettings | ServoSettings) -> dict[str, tuple[str, str]]:
-    """Key and text by the field's name without its unit."""
-    pairs = board_fields(part) if isinstance(part, BoardSettings) else servo_fields(part)
-    return {_bare(key): (key, text) for key, text in pairs}
-
-
-def _bare(key: str) -> str:
-    split = split_suffix(key)
-    return key if split is None else split[0]
-
-
-def _entry(node: yaml.Node | None, field: str) -> tuple[yaml.Node, yaml.Node]:
-    pairs = node.value if isinstance(node, yaml.MappingNode) else []
-    matches = [(pair[0], pair[1]) for pair in pairs if field in (pair[0].value, _bare(str(pair[0].value)))]
-    if not matches:
-        raise LookupError(field)
-    return matches[0]
-
-
-def _value(node: yaml.Node | None, field: str) -> yaml.Node:
-    return _entry(node, field)[1]
-
-
-def _end(node: yaml.Node) -> int:
-    if not isinstance(node, yaml.CollectionNode) or _is_flow(node) or not node.value:
-        return int(node.end_mark.index)
-    last = node.value[-1]
-    return _end(last[1] if isinstance(last, tuple) else last)
-
-
-def _is_flow(node: yaml.Node) -> bool:
-    return isinstance(node, yaml.CollectionNode) and bool(node.flow_style)
-
-
 RESULTS = "servo.json"
 _APART = math.radians(0.5)  # Knots that are nearer to the end of a shortened table add nothing
 Part = TypeVar("Part", BoardSettings, ServoSettings)
@@ -252,7 +169,8 @@ def _changed(part: Part, **values: Any) -> Part:
 def write_servo_file(path: Path, file: ServoFile) -> Path | None:
     """Put a servo file in place whole; the one before is kept beside it. Where that is, None if nothing changed.
 
-    Numbers are changed where they stand, so that comments stay; where that cannot be, the file is written anew.
+    Of a part that stands on one line, as armcal writes it, only that line changes, up to its comment. Where a part
+    stands otherwise, the whole file is written anew.
 
     Raises:
         InputError: it cannot be written; the one before is as it was.
@@ -262,29 +180,24 @@ def write_servo_file(path: Path, file: ServoFile) -> Path | None:
         before = path.read_bytes()
         if not path.stat().st_mode & 0o222:
             raise PermissionError(errno.EACCES, "it is read-only")
-        text = _text_of(path, before.decode(), file).encode()
-        if text == before:
+        stated = load_servo_file(path)
+        if stated == file:
             return None
         kept = next_name(path)
         write_whole(kept, before)
-        write_whole(path, text)
+        write_whole(path, _text_of(before.decode(), stated, file).encode())
     return kept
 
 
-def _text_of(path: Path, before: str, file: ServoFile) -> str:
-    """The file's text with other numbers, if that is read as what is meant; else the whole file written anew."""
-    text = edited_text(before, load_servo_file(path), file)
-    if text is not None:
-        tried = path.with_name(f".{path.name}.new")
-        try:
-            write_whole(tried, text.encode())
-            if load_servo_file(tried) == file:
-                return text
-        except ConfigError:
-            pass
-        finally:
-            tried.unlink(missing_ok=True)
-    return servo_file_text(file)
+def _text_of(text: str, stated: ServoFile, file: ServoFile) -> str:
+    was, now = servo_file_text(stated).splitlines(), servo_file_text(file).splitlines()
+    for before, after in zip(was, now, strict=True):
+        if before != after:
+            name = re.escape(after.partition(": {")[0])
+            text, count = re.subn(rf"(?m)^{name}: \{{[^{{}}]*\}}(?=[ \t]*(#.*)?$)", lambda _, new=after: new, text)
+            if count != 1:
+                return "\n".join(now) + "\n"
+    return text
 
 
 def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
