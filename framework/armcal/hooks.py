@@ -167,7 +167,7 @@ _KINDS = {
         *(f"devices.device:{name}" for name in ("JointDevice", "PulseDevice", "MeasuringDevice")),
     ),
     "tracker": _kind("trackers", "Tracker(settings)", "devices.live:Tracker"),
-    "joints": _kind("joint_streams", "Stream(settings)", "devices.live:JointStream", "devices.live:RestStream"),
+    "joints": _kind("joint_streams", "Stream(settings)", "devices.live:JointStream"),
     "camera": _kind("cameras", "Camera(settings)", "devices.live:LiveCamera"),
     "bench": _kind("benches", "Bench(settings)", "devices.simulated:SimulatedBench"),
     "check": _kind("checks", "check(fit)", "diagnose.checks:CheckFunction"),

@@ -25,7 +25,7 @@ from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
 
 from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.recording.window import RecordingSettings
+from armcal_bench.recording.postures import RecordingSettings
 
 _LEAST_OUTLIER_M = 2e-4
 _NAMES_SHOWN = 8

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import isfinite, isnan
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -54,22 +54,6 @@ class JointStream(Protocol):
 
     def close(self) -> None:
         """Stop. May be called twice."""
-
-
-@runtime_checkable
-class RestStream(Protocol):
-    """What a joint stream may provide beside the rest: each sample is then the mean of a whole rest, once it is over.
-
-    Attributes:
-        gives_rests: whether it is set to do so.
-    """
-
-    @property
-    def gives_rests(self) -> bool:
-        """See above."""
-
-    def lasting(self) -> list[JointSample]:
-        """The rest that still lasts, if it is one already; for when nobody waits for its end. It is given once."""
 
 
 REPEATED = "a repeated frame number"
@@ -185,10 +169,9 @@ def frames_of(tracker: Tracker) -> list[TrackerFrame]:
     return frames
 
 
-def samples_of(stream: JointStream, which: Literal["samples", "lasting"] = "samples") -> list[JointSample]:
-    """All joint readings that came since the last call; or the rest that lasts, of a stream that gives rests."""
-    method = stream.lasting if which == "lasting" and isinstance(stream, RestStream) else stream.samples
-    samples = method()
+def samples_of(stream: JointStream) -> list[JointSample]:
+    """All joint readings that came since the last call."""
+    method, samples = stream.samples, stream.samples()
     with expecting(method, samples, "a list of JointSample(arrived, stamp, angles, labels), of numbers and texts"):
         samples = list(samples)
         for sample in samples:

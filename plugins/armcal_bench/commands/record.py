@@ -24,9 +24,8 @@ from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
 from armcal_bench.keys import RECORDING_KEYS, OperatorInput, single_keys
-from armcal_bench.recording.recorder import KEYS, LOOK, Message
-from armcal_bench.recording.recording_log import DATASET, IMAGES
-from armcal_bench.recording.session import record
+from armcal_bench.recording.postures import DATASET, IMAGES
+from armcal_bench.recording.recorder import KEYS, LOOK, Message, record
 
 _TERMINAL = Path("/dev/tty")
 _AS_CSV = "--set 'data={type: csv}' "  # For a run whose configuration reads another kind of data

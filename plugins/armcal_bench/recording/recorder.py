@@ -1,7 +1,7 @@
-"""Postures captured from a stream of readings, at a command or when the arm has come to rest; nothing waits here."""
+"""A recording: postures captured from a stream of readings, at a command or when the arm has come to rest."""
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -9,20 +9,40 @@ from typing import Any, Literal
 import numpy as np
 from armcal.devices.clock import Clock
 from armcal.devices.line_source import refused_lines_text
-from armcal.devices.live import JointSample, JointStream, LiveCamera, Shot, refused_by, shot_of, shots_of
+from armcal.devices.live import (
+    JointSample,
+    JointStream,
+    LiveCamera,
+    Shot,
+    refused_by,
+    samples_of,
+    shot_of,
+    shots_of,
+)
 from armcal.errors import InputError
 from armcal.io.plain_files import write_over
 from armcal.measure.environment import warn_beyond_limits
+from armcal.plugins import refuse
 
-from armcal_bench.bench import Bench
-from armcal_bench.recording.agreement import Advice, Assessment, Assessor
-from armcal_bench.recording.labels import Labels
-from armcal_bench.recording.recording_log import IMAGES, Posture, RecordingLog, dataset_of, write_dataset
-from armcal_bench.recording.window import JointKinds, Mean, SampleWindow
+from armcal_bench.bench import Bench, closing
+from armcal_bench.journal_folder import Start, opened_journal
+from armcal_bench.keys import END, OperatorInput
+from armcal_bench.recording.agreement import Assessment, Assessor, contacts_of
+from armcal_bench.recording.postures import (
+    IMAGES,
+    OURS,
+    JointKinds,
+    Labels,
+    Mean,
+    Posture,
+    RecordingLog,
+    SampleWindow,
+    dataset_of,
+    write_dataset,
+)
 
-Capture = Literal["keys", "still", "rests", "images"]
-"""When postures are captured: at a command, when the arm has stood for a while, at each rest of the stream, or when an
-image comes."""
+Capture = Literal["keys", "still", "images"]
+"""When postures are captured: at a command, when the arm has stood for a while, or when an image comes."""
 KEYS = "c or Enter captures, u takes the last one back, g NAME or a digit names what is touched, s tells more, q ends"
 LOOK = "v looks without keeping"
 _MOST_UNSEEN = 20  # Images without a board, and none with one: something is wrong for all of them
@@ -79,23 +99,24 @@ def _doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Po
     return messages
 
 
-def _added(after: Advice, before: Advice) -> str:
-    """What is known now, and how much it fell by; empty where that is not known."""
-    fell = after.fell_by(before)
+def _added(after: Assessment, before: Assessment) -> tuple[str, float | None]:
+    """What is known now of an instrument (empty: nothing), and the share by which its standard deviations fell."""
+    ratios = [sd / before.deviations[name] for name, sd in after.deviations.items() if name in before.deviations]
+    fell = 1 - float(np.median(ratios)) if ratios else None
     if not after.accuracy:
-        return ""
+        return "", fell
     changed = "" if fell is None else f" (standard deviations {'fell' if fell >= 0 else 'rose'} by {abs(fell):.0%})"
-    return f"{' '.join(after.accuracy).rstrip('.')}{changed}"
+    return f"{' '.join(after.accuracy).rstrip('.')}{changed}", fell
 
 
-def _advised(after: Advice, before: Advice) -> list[Message]:
-    messages, text = [], _added(after, before)
+def _advised(after: Assessment, before: Assessment) -> list[Message]:
+    messages, (text, fell) = [], _added(after, before)
     if text:
-        messages.append(Message("known", f"{text}.", {"accuracy": list(after.accuracy), "fell": after.fell_by(before)}))
-    if after.next:
-        sentence = f"next, if the way is clear: about {after.next}"
-        sentence += f", {1 - after.shrink:.0%} less uncertain." if after.shrink < 1 else "."
-        messages.append(Message("next", sentence, {"joints": dict(after.commands), "shrink": after.shrink}))
+        messages.append(Message("known", f"{text}.", {"accuracy": list(after.accuracy), "fell": fell}))
+    if after.next is not None:
+        sentence = f"next, if the way is clear: about {after.next.text}"
+        sentence += f", {1 - after.next.shrink:.0%} less uncertain." if after.next.shrink < 1 else "."
+        messages.append(Message("next", sentence, {"joints": after.next.commands, "shrink": after.next.shrink}))
     return messages
 
 
@@ -145,7 +166,7 @@ class Recorder:
         postures = self._log.postures
         if not postures:
             return []
-        self._assessment = self._assessor.anew(postures)
+        self._assessment = self._assessor.assessed(postures)
         self._write()
         there = Message("status", f"{len(postures)} postures are there already.", {"postures": len(postures)})
         return [there, *self._known()]
@@ -159,16 +180,13 @@ class Recorder:
                 self._fault_at = sample.arrived
                 self._window.clear()
                 continue
-            if self.capture == "rests":
-                messages += self._kept(Mean(sample.angles, 0.0, 1, sample.labels, sample.stamp))
-                continue
             self._window.add(sample)
             if self.capture == "still":
                 messages += self._kept_if_elsewhere()
         messages += self._taken_as_they_come()
         if samples and not self._fault:
             self._heard = self._clock.now()  # judging a posture takes a while, in which nobody listens
-        is_silent = self.capture != "rests" and self._silence() > self._settings.stale
+        is_silent = self._silence() > self._settings.stale
         if is_silent != self._is_silent:
             self._is_silent = is_silent
             heard = Message("heard", "joint readings come again.")
@@ -194,8 +212,6 @@ class Recorder:
         """Something that was typed."""
         word, _, rest = text.strip().partition(" ")
         if word in ("", "c", "v"):
-            if self.capture == "rests":
-                return [_refused("rests are captured by themselves, when they are over.")]
             if self.capture == "images":
                 return [_refused("postures are captured when their images come.")]
             if self._fault or self._silence() > self._settings.stale:
@@ -209,7 +225,7 @@ class Recorder:
             if posture is None:
                 return [_refused("there is no posture to take back.")]
             before = self._assessment
-            self._assessment = self._assessor.anew(self._log.postures)
+            self._assessment = self._assessor.assessed(self._log.postures)
             self._write()
             messages = [Message("undone", f"posture {posture.name} is taken back.", {"posture": posture.name})]
             return messages + _doubts_changed(before, self._assessment, self._log.postures) + self._known()
@@ -253,8 +269,8 @@ class Recorder:
         if shot.fault:
             return [_refused(shot.fault)]
         posture = self._log.next_posture(mean, self.labels.present, shot.values)
-        known = self._assessor.tried([*self._log.postures, posture])
-        text = _added(known.advice, self._assessment.advice)
+        known = self._assessor.assessed([*self._log.postures, posture])
+        text, _ = _added(known, self._assessment)
         return [Message("seen", f"{shot.seen}; with it {text}." if text else f"{shot.seen}.", {"kept": False})]
 
     def _kept(self, mean: Mean, shot: Shot | None = None) -> list[Message]:
@@ -274,10 +290,10 @@ class Recorder:
         self._log.capture(posture)
         self._write()
         postures, before = self._log.postures, self._assessment
-        self._assessment = self._assessor.with_newest(postures)
+        self._assessment = self._assessor.assessed(postures)
         if set(before.doubts) != set(self._assessment.doubts):
             self._write()
-        messages += [_captured(posture, self._assessment), *_advised(self._assessment.advice, before.advice)]
+        messages += [_captured(posture, self._assessment), *_advised(self._assessment, before)]
         messages += _doubts_changed(before, self._assessment, postures)
         return messages + self._warnings(posture) + self._known()
 
@@ -359,3 +375,73 @@ class Recorder:
 
 def _refused(why: str) -> Message:
     return Message("refused", why)
+
+
+_PERIOD_S = 0.02
+_SAME = {"joints": "set of joints", "labels": "set of labels"}
+"""What a recording that is resumed must have been begun with: entries of the journal's header, and their names."""
+
+
+def record(
+    bench: Bench,
+    to: tuple[Path, Start],
+    capture: Capture,
+    keys: OperatorInput,
+    asked_to_end: Callable[[], bool],
+    show: Callable[[Message], None],
+) -> Message:
+    """Record until somebody ends it, or the stream ends; how it ended.
+
+    Args:
+        bench: what is recorded.
+        to: where everything of it is kept, and ``anew``, or ``resume`` what is there.
+        capture: what makes a posture be captured; a camera that gives images by itself goes before it.
+        keys: what a person types.
+        asked_to_end: whether somebody wants it to end.
+        show: called with every message.
+
+    Raises:
+        InputError: the configuration, the folder or the stream is refused.
+        ArmcalError: the journal cannot be written; all postures that were said to be kept are.
+    """
+    camera = bench.camera()
+    channels = JointKinds.of(bench.experiment.system.arms).channels
+    columns = Labels(bench.experiment.system.measurements, ()).columns
+    header = {"joints": list(channels), "labels": list(columns)}
+    stream = bench.joints()
+    if camera is not None and camera.gives_shots:
+        capture = "images"
+    with bench.clock() as clock, closing(stream, *(() if camera is None else (camera,))):
+        if camera is not None:
+            camera.open(clock, bench.experiment.system.measurements)
+            if camera.measurement not in bench.experiment.system.measurements:
+                known = ", ".join(bench.experiment.system.measurements)
+                refuse(type(camera), f"{camera.measurement!r} as measurement", f"one of {known}")
+        contacts_of(bench.experiment, camera)
+        stream.open(clock, channels)
+        with opened_journal(*to, OURS, header, "recording", _SAME) as journal:
+            if camera is not None:
+                (to[0] / IMAGES).mkdir(exist_ok=True)
+            recorder = Recorder(bench, stream, capture, to[0], RecordingLog(journal), clock, camera)
+            for message in _messages(recorder, stream, keys, asked_to_end, clock):
+                show(message)
+            return recorder.finished()
+
+
+def _messages(
+    recorder: Recorder, stream: JointStream, keys: OperatorInput, asked_to_end: Callable[[], bool], clock: Clock
+) -> Iterator[Message]:
+    """All that happens, as it does, until somebody ends it or the stream ends."""
+    yield from recorder.begin()
+    while True:
+        has_ended = stream.ended  # before its last samples are taken
+        yield from recorder.take(samples_of(stream))
+        command = keys.next()  # one a round, so that each finds fresh readings
+        if command is not None:
+            if command.strip() == END:
+                break
+            yield from recorder.command(command)
+        is_over = has_ended or (keys.ended and recorder.capture == "keys")
+        if asked_to_end() or (is_over and command is None):
+            break
+        clock.sleep(_PERIOD_S)

@@ -194,9 +194,10 @@ def _text_of(text: str, stated: ServoFile, file: ServoFile) -> str:
     for before, after in zip(was, now, strict=True):
         if before != after:
             name = re.escape(after.partition(": {")[0])
-            text, count = re.subn(rf"(?m)^{name}: \{{[^{{}}]*\}}(?=[ \t]*(#.*)?$)", lambda _, new=after: new, text)
-            if count != 1:
-                return "\n".join(now) + "\n"
+            places = list(re.finditer(rf"(?m)^{name}: \{{[^{{}}&*\n]*\}}(?=[ \t]*(#.*)?$)", text))
+            if len(places) != 1:
+                return servo_file_text(file)
+            text = f"{text[: places[0].start()]}{after}{text[places[0].end() :]}"
     return text
 
 
