@@ -7,8 +7,8 @@ measured; positions alone show the gain by three, and the handedness by five.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import dataclass
+from itertools import combinations, product
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -44,9 +44,6 @@ class MeasuredFrame:
     gain: float  # measured lengths, in lengths of the model
     is_mirrored: bool  # whether the frame is left-handed; ``mirror`` is -1 then, else 1
     with_rotations: bool  # whether the measured rotations agree with the model's in this frame; False where none are
-    turn: Array  # ``frame_R_base`` (3 x 3, proper)
-    shift: Array  # of the base's origin (3, m, measured lengths)
-    target: Array  # where the target is on the model's tool (3, m)
     left: float
 
 
@@ -73,20 +70,23 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
     spread, reach = spread_of(expected[:, :3, 3].T), float(np.linalg.norm(expected[:, :3, 3], axis=1).max())
     moved = spread_of(seen[:, :3, 3].T)
     shows_gain = spread > _LEAST_MOTION * reach or moved > _FAR_MOTION * reach
-    straight = {with_rotations: _fitted(expected, seen, _Reading(1.0, 1.0, with_rotations)) for with_rotations in _BOTH}
+    straight = {rotations: _fitted(expected, seen, 1.0, 1.0, rotations) for rotations in (True, False)}
     if straight[True].left <= MISSES * spread:
         return None
-    fitting: list[MeasuredFrame] = []
-    for reading in _READINGS:
-        if reading.is_possible(seen):
-            other = _fitted(expected, seen, reading)
-            enough = min(FITS * spread, straight[reading.with_rotations].left / MUCH_BETTER)
-            gains = (other.gain, moved / spread if spread else np.inf)
-            is_gain = other.gain > _LEAST_GAIN and not any(1 / _GAIN_OFF < gain < _GAIN_OFF for gain in gains)
-            if reading.gain is None and not (shows_gain and is_gain):
-                continue
-            if other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):
-                fitting.append(other)
+    fitting, are_measured = list[MeasuredFrame](), not bool(np.isnan(seen[:, 0, 0]).any())
+    for gain, mirror, rotations in product((None, 1.0), (1.0, -1.0), (True, False)):
+        # Without rotations three points lie in one plane, four almost: they show no reflection.
+        shows_mirror = (rotations and are_measured) or len(seen) >= _FEWEST_FOR_TARGET
+        if (gain and mirror > 0) or (mirror < 0 and not shows_mirror):
+            continue
+        other = _fitted(expected, seen, gain, mirror, rotations)
+        enough = min(FITS * spread, straight[rotations].left / MUCH_BETTER)
+        gains = (other.gain, moved / spread if spread else np.inf)
+        is_gain = other.gain > _LEAST_GAIN and not any(1 / _GAIN_OFF < each < _GAIN_OFF for each in gains)
+        if gain is None and not (shows_gain and is_gain):
+            continue
+        if other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):
+            fitting.append(other)
     if not fitting:
         return None
     fitting.sort(key=lambda other: other.left)
@@ -95,62 +95,44 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
     return _mistake(best, len(seen))
 
 
-_BOTH = (True, False)
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """What is assumed of a frame: its gain (None: any), its handedness, and whether rotations are of it as well."""
-
-    gain: float | None = None
-    mirror: float = 1.0
-    with_rotations: bool = False
-
-    def is_possible(self, seen: Array) -> bool:
-        """Whether enough was measured of it: without rotations three points lie in one plane, four almost."""
-        has_rotations = self.with_rotations and not bool(np.isnan(seen[:, 0, 0]).any())
-        return self.mirror > 0 or has_rotations or len(seen) >= _FEWEST_FOR_TARGET
-
-
-_READINGS = tuple(
-    _Reading(gain, mirror, with_rotations)
-    for gain in (None, 1.0)
-    for mirror in (1.0, -1.0)
-    for with_rotations in _BOTH
-    if gain is None or mirror < 0
-)
-
-
-def _fitted(expected: Array, seen: Array, reading: _Reading) -> MeasuredFrame:
-    """Turn, shift, target and gain by turns, each the least squares of all others."""
+def _fitted(expected: Array, seen: Array, stated: float | None, mirror: float, with_rotations: bool) -> MeasuredFrame:
+    """Turn, shift, target and gain (where none is stated) by turns, each the least squares of all others."""
     places, goals, count = expected[:, :3, 3], seen[:, :3, 3], len(seen)
-    has_rotations = reading.with_rotations and not bool(np.isnan(seen[:, 0, 0]).any())
+    has_rotations = with_rotations and not bool(np.isnan(seen[:, 0, 0]).any())
     pairs = list(combinations(range(count), 2)) if has_rotations else []
     fits_target = has_rotations or count >= _FEWEST_FOR_TARGET
     axes, seen_axes = _sines(expected, pairs), _sines(seen, pairs)
-    lever, gain, target = spread_of(places.T), reading.gain or 1.0, np.zeros(3)
+    lever, gain, target = spread_of(places.T), stated or 1.0, np.zeros(3)
     turn, shift, points = np.eye(3), np.zeros(3), places
     for _ in range(_ROUNDS):
         before = target
         centred, seen_centred = points - points.mean(axis=0), goals - goals.mean(axis=0)
         size = max(spread_of(goals.T), _TINY)
-        both = np.vstack([reading.mirror * lever * centred, lever**2 * axes]).T
+        both = np.vstack([mirror * lever * centred, lever**2 * axes]).T
         others = np.vstack([lever * seen_centred * (spread_of(points.T) / size), lever**2 * seen_axes]).T
         # With their opposites vectors have the origin as their middle.
         turn = rigid_fit(*(np.hstack([vectors, -vectors]) for vectors in (both, others)))[0]
-        moved = reading.mirror * centred @ turn.T
-        if reading.gain is None:
+        moved = mirror * centred @ turn.T
+        if stated is None:
             gain = max(float(np.sum(moved * seen_centred) / max(np.sum(moved**2), _TINY**2)), _TINY)
-        shift = goals.mean(axis=0) - gain * reading.mirror * turn @ points.mean(axis=0)
+        shift = goals.mean(axis=0) - gain * mirror * turn @ points.mean(axis=0)
         if not fits_target:
             break
-        target = _target(expected, reading.mirror * (goals / gain) @ turn)
+        target = _target(expected, mirror * (goals / gain) @ turn)
         points = places + expected[:, :3, :3] @ target
         if np.linalg.norm(target - before) < _TINY:
             break
-    fitted = MeasuredFrame(gain, reading.mirror < 0, has_rotations, turn, shift, target, 0.0)
-    numbers = 6 + (reading.gain is None) + 3 * fits_target
-    return replace(fitted, left=_left(fitted, points, goals, (expected, seen), pairs, numbers))
+    off = (goals - shift) / gain - mirror * points @ turn.T
+    squares, equations = float(np.sum(off**2)), 3 * count - (6 + (stated is None) + 3 * fits_target)
+    if pairs:
+        one, other = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
+        shown, measured = ((p[other, :3, :3] @ np.swapaxes(p[one, :3, :3], 1, 2)) for p in (expected, seen))
+        traces = np.einsum("nij,nij->n", turn @ shown @ turn.T, measured)
+        angles = np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))
+        # as many independent rotations as poses but one, shared among the pairs
+        squares += _LEVER_M**2 * float(np.mean(angles**2)) * 3 * (count - 1)
+        equations += 3 * (count - 1)
+    return MeasuredFrame(gain, mirror < 0, has_rotations, float(np.sqrt(3 * squares / max(equations, 1))))
 
 
 def _sines(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
@@ -172,28 +154,6 @@ def _target(expected: Array, goals: Array) -> Array:
     weak = _TARGET_WEIGHT * np.eye(3)
     target = np.linalg.lstsq(np.vstack([rows, weak]), np.concatenate([sizes, np.zeros(3)]), rcond=None)[0]
     return np.asarray(target * min(1.0, _MOST_TARGET_M / max(float(np.linalg.norm(target)), _TINY)))
-
-
-def _left(
-    frame: MeasuredFrame,
-    points: Array,
-    goals: Array,
-    poses: tuple[Array, Array],
-    pairs: Sequence[tuple[int, int]],
-    numbers: int,
-) -> float:
-    mirror = -1.0 if frame.is_mirrored else 1.0
-    off = (goals - frame.shift) / frame.gain - mirror * points @ frame.turn.T
-    squares, equations = float(np.sum(off**2)), 3 * len(goals)
-    if pairs:
-        one, other = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
-        shown, seen = ((p[other, :3, :3] @ np.swapaxes(p[one, :3, :3], 1, 2)) for p in poses)
-        traces = np.einsum("nij,nij->n", frame.turn @ shown @ frame.turn.T, seen)
-        angles = np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))
-        # as many independent rotations as poses but one, shared among the pairs
-        squares += _LEVER_M**2 * float(np.mean(angles**2)) * 3 * (len(goals) - 1)
-        equations += 3 * (len(goals) - 1)
-    return float(np.sqrt(3 * squares / max(equations - numbers, 1)))
 
 
 def _mistake(frame: MeasuredFrame, count: int) -> FrameMistake:

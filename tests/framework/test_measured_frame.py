@@ -12,7 +12,7 @@ from armcal.base.units import length_mistake
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.run.experiment import Experiment
 from armcal_bench.measured_frame import frame_mistake
-from armcal_bench.servo.rigid_arm import RigidArm
+from armcal_bench.servo.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.servo_records import ElasticArm

@@ -84,7 +84,7 @@ def judged(wrong: dict[int, float], count: int, order: list[int] | None = None) 
         angles[place] += np.radians(degrees)
     dataset = replace(dataset, channels={**dataset.channels, "arm.j4": angles})
     doubtful, values = set[int](), dict[str, tuple[float, ...]]()
-    for stop in range(1, count + 1):
+    for stop in range(2, count + 1):
         part = dataset.subset(range(stop))
         fitter = QuickFitter(experiment.of_records(part), dict(experiment.system.measurements), part, values)
         groups = ["/".join(each) for each in zip(part.extra["position"], part.extra["socket"], strict=True)]

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal_bench.servo.fit import outcome_of
-from armcal_bench.servo.rigid_arm import RigidArm
-from armcal_bench.servo.setup import ServoCalibrationSettings
-from armcal_bench.servo.tables import KnownServo
+from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings
+from armcal_bench.servo.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.own_arms import POST, _config

@@ -13,8 +13,7 @@ from armcal.config.yaml_source import load_config
 from armcal.run.experiment import Experiment
 from armcal_bench.servo.fit import outcome_of
 from armcal_bench.servo.outputs import findings, improved, results, write_servo_file
-from armcal_bench.servo.setup import ServoCalibrationSettings
-from armcal_bench.servo.tables import KnownServo
+from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS

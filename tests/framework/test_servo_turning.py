@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
-from armcal_bench.servo.rigid_arm import RigidArm
-from armcal_bench.servo.trial import Move, judged, swapped, wrapped
+from armcal_bench.joint_check import Move, judged, swapped
+from armcal_bench.servo.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS
@@ -81,10 +81,3 @@ def test_a_wrong_size_and_a_dead_servo_are_found(arm):
     found = judged(moves_of(arm, gains={"q2": 0.5, "q4": 0.0}), BASE, arm)
     verdicts = {v.joint: v.kind for v in found}
     assert (verdicts["q2"], verdicts["q4"], verdicts["q1"]) == ("gain", "still", "right")
-
-
-def test_a_table_a_turn_away_is_found():
-    turn = math.radians(360)
-    table = (turn - 1.7, turn, turn + 1.7)
-    assert "Subtract 360 deg" in wrapped("q1", table, (-1.7, 1.7)).mend
-    assert wrapped("q1", (-1.7, 0, 1.7), (-0.8, 0.8)) is None

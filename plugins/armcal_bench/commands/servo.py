@@ -20,12 +20,12 @@ from armcal.report.document import Document, Section, Table
 
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
-from armcal_bench.joint_check import check_joints
+from armcal_bench.joint_check import Verdict, check_joints, swapped
 from armcal_bench.keys import servo_input
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
-from armcal_bench.servo.session import adapter_of, evaluated, measure, park, tried
+from armcal_bench.servo.record import Record
+from armcal_bench.servo.session import evaluated, measure, park, tried
 from armcal_bench.servo.setup import Conversation, Setup
-from armcal_bench.servo.trial import Verdict, swapped
 
 
 @click.command("servo")
@@ -87,7 +87,7 @@ def servo(
 def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:
     """Fit what a folder holds, and write the tables. Missing ones must not look like a success to a script."""
     outcome = evaluated(setup, out)
-    changed = improved(setup.file, outcome, adapter_of(out))
+    changed = improved(setup.file, outcome, str((Record(out).begun or {}).get("adapter", "")))
     content = results(outcome, changed)
     write_results(out, content)
     earlier = None if keep else write_servo_file(setup.path, changed)

@@ -130,7 +130,7 @@ class QuickFitter:
         for block in parameters.free:
             if len(known.get(block.name, ())) == block.size:
                 start[parameters.entries_of(block.name)] = known[block.name]
-        self._begin = Fitted(start, np.zeros((0, 0)), 1.0, 0.0, np.zeros(len(dataset), dtype=bool))
+        self._start = start
         self._rows, self._numbers = np.zeros((2, len(dataset)))
         for kernel, record in zip(self._weak.kernels, self._weak.records, strict=True):
             rows = np.full(len(dataset), kernel.factor.rows)
@@ -144,11 +144,12 @@ class QuickFitter:
         parameters = self._weak.parameters
         return {b.name: tuple(fitted.values[parameters.entries_of(b.name)].tolist()) for b in parameters.free}
 
-    def fit(self, used: Mask, before: Fitted) -> Fitted:
+    def fit(self, used: Mask, before: Fitted | None = None) -> Fitted:
         """Fit some of the postures (N), from where another fit ended."""
         parameters, problem = self._weak.parameters, _used(self._weak, used)
         posed = PosedProblem(problem)
-        x = parameters.local(before.values) / parameters.increment_scales()
+        start = self._start if before is None else before.values
+        x = parameters.local(start) / parameters.increment_scales()
         values = posed.values(descended(posed, x, _MOST_STEPS, _DAMPING, _AT_REST))
         triangle = problem.triangular_factor(values)
         spent, equations = InverseInformation.of(triangle, parameters).spent, problem.equations()
@@ -162,18 +163,18 @@ class QuickFitter:
     def agreeing(self, groups: Sequence[str], doubtful: Collection[int] = ()) -> Fitted:
         """A fit of the postures that agree; of ``groups`` (N) with one posture none can be compared.
 
-        It is begun with all of them, and without the newest and those in doubt before (places): several wrong ones hide
-        each other, and what once was outvoted may be right.
+        It is begun without the newest and those in doubt before (places), for several wrong ones hide each other; and
+        with all, for what once was outvoted may be right.
         """
-        starts = [set[int](), {*doubtful, len(groups) - 1}] if len(groups) > 1 else [set[int]()]
-        fits = [self._trimmed(np.array(groups, dtype=object), start) for start in starts]
-        unlikely = -np.log(_CHANCE)
-        return min(fits, key=lambda one: self._numbers.sum() * np.log(one.scale) + unlikely * np.sum(~one.used))
+        names, unlikely = np.array(groups, dtype=object), -np.log(_CHANCE)
+        kept, anew = (self._trimmed(names, aside) for aside in ({*doubtful, len(names) - 1}, ()))
+        scores = [self._numbers.sum() * np.log(one.scale) + unlikely * np.sum(~one.used) for one in (kept, anew)]
+        return anew if scores[1] < scores[0] - 1 else kept
 
     def _trimmed(self, names: NDArray[np.object_], aside: Collection[int]) -> Fitted:
         """Whatever lies far off by the median is set aside, the farthest first; what does not disagree comes back."""
         places = np.arange(len(names))
-        fitted = self.fit(~np.isin(places, list(aside)), self._begin)
+        fitted = self.fit(~np.isin(places, list(aside)))
         for _ in range(max(_MOST_DROPPED, len(names) // 3)):
             weights = [fitted.used.astype(float)] * len(self._weak.records)
             far = studentised_distances(self._weak, fitted.values, weights)
@@ -364,15 +365,17 @@ class Assessor:
         try:
             experiment, dataset, fitter = self._fitter(postures)
             groups = [posture.place for posture in postures]
+            known = self._known(experiment, fitter.problem, dataset)
+            if len(postures) == 1:
+                return Assessment(known=known)
             fitted = fitter.agreeing(groups, [i for i, one in enumerate(postures) if one.name in self._doubtful])
-            doubts = {postures[i].name: fitter.compared(fitted, int(i))[0] for i in np.flatnonzero(~fitted.used)}
+            doubts = {postures[i].name: fitter.compared(fitted, i)[0] for i in np.flatnonzero(~fitted.used).tolist()}
             newest, last, others = doubts.get(postures[-1].name), len(postures) - 1, fitted.used.copy()
             others[last] = False
             if newest is None and groups[-1] in np.array(groups, dtype=object)[others]:
-                newest = fitter.compared(fitter.fit(others, fitted), last)[0]
+                newest = fitter.compared(fitter.fit(others), last)[0]
             self._doubtful, self._values = tuple(doubts), fitter.free_values(fitted)
-            judged = Assessment(newest, doubts, self._known(experiment, fitter.problem, dataset))
-            return _advised(judged, fitter.problem, fitted, dataset)
+            return _advised(Assessment(newest, doubts, known), fitter.problem, fitted, dataset)
         except _UNFIT as fault:  # what was captured is safe, and so is what comes
             return Assessment(why_not=str(fault))
 

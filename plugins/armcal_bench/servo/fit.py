@@ -15,6 +15,7 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.arrays import Array, Mask
+from armcal.base.dataset import Dataset
 from armcal.base.poses import NO_TURN
 from armcal.base.quaternions import quaternion_of
 from armcal.errors import NotConvergedError
@@ -22,12 +23,65 @@ from armcal.measure.rests import mean_rotation
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
+from armcal_bench.joint_check import permuted
 from armcal_bench.servo.record import ANGLE, POSE
-from armcal_bench.servo.rigid_arm import RigidArm, lever, turn_of_point, twist_angles
-from armcal_bench.servo.setup import ServoCalibrationSettings
-from armcal_bench.servo.sighting import BODY, TABLES, Body, BodyFit, Corrections, Seen
-from armcal_bench.servo.tables import FittedServo, KnownServo, Outcome, Zero, piecewise
-from armcal_bench.servo.trial import permuted
+from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings, piecewise
+from armcal_bench.servo.tracked_body import (
+    BODY,
+    TABLES,
+    Body,
+    BodyFit,
+    Corrections,
+    RigidArm,
+    body_dataset,
+    lever,
+    turn_of_point,
+    twist_angles,
+)
+
+Zero = Literal["kept", "measured"]
+
+
+@dataclass(frozen=True)
+class FittedServo:
+    """A servo's table and backlash.
+
+    Attributes:
+        pulses, pulse_sds: at the knots (s); of a knot that no observation determines the stated pulse, and NaN.
+        lag, lag_sd: half the backlash (rad); None where it was not approached from both sides.
+    """
+
+    known: KnownServo  # as it was stated
+    angles: tuple[float, ...]  # knots (rad)
+    pulses: tuple[float, ...]
+    pulse_sds: tuple[float, ...]
+    determined: tuple[bool, ...]  # whether the observations determine the pulse of a knot
+    lag: float | None
+    lag_sd: float
+    scatter: float  # of the observed angles about the fit (rad, root mean square)
+    scale: float  # the same in units of the stated deviations; deviations are enlarged by it where it is above 1
+    used: int  # how many observations
+    outliers: tuple[tuple[int, float], ...]  # those set aside: counts and angle (rad)
+    reach: tuple[float, float]  # the lowest and highest angle observed (rad)
+    by: str  # what showed the angles: ``rotation``, ``position`` or ``somebody``
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a record says.
+
+    Attributes:
+        compliances: of the arm's springs (rad/(N m)) by parameter, value and deviation, where they were determined.
+    """
+
+    servos: Mapping[str, FittedServo]  # by joint
+    clocks: Mapping[str, PulseClock]  # by board, as stated when it was measured
+    silent: Mapping[str, str]  # why a joint's table could not be found, by joint
+    compliances: Mapping[str, tuple[float, float]]
+    undetermined: tuple[str, ...]  # compliances that the observations do not determine
+    zero: Zero  # whether stated zeros were kept
+    sag_span: Mapping[str, float]  # by joint, how much what the springs give varies over its sweep (rad)
+
 
 Entry = Mapping[str, Any]
 WEAK_SD = 0.6
@@ -50,8 +104,8 @@ class _Sweep:
 
     Attributes:
         pulses: of the table at the servo's knots (counts).
-        zero: what is added to the table's angles (rad).
         kept: which lines count.
+        radius: by which an angle about the joint becomes what is compared: of its circle (m), or one.
     """
 
     known: KnownServo
@@ -63,7 +117,7 @@ class _Sweep:
     arms: Array  # from the axis to the body (N x 3, m)
     pulses: Array
     kept: Mask
-    zero: float = 0.0
+    radius: float = 1.0
 
     @property
     def counts(self) -> Array:
@@ -157,7 +211,7 @@ def _sweep_of(
     by = "position" if any(line["rotation"] is None for line in lines) else "rotation"
     poses[:, :3, :3] = [np.full((3, 3), np.nan) if line["rotation"] is None else line["rotation"] for line in lines]
     deviations = np.array([[d or 0.0 for d in line["deviations"]] for line in lines])
-    arms = poses[:, :3, 3] - origin
+    arms, radius = poses[:, :3, 3] - origin, 1.0
     counts = np.array([line["counts"] for line in lines])
     table = PulseTable(servo.table.angles, servo.table.pulses)
     commanded = np.array([float(table.angle(count * tick)) for count in counts])
@@ -172,24 +226,18 @@ def _sweep_of(
             return f"the tool did not turn about this joint's axis: {_CHECK_IT}"
         sds = np.linalg.norm(np.einsum("nji,j->ni", poses[:, :3, :3], axis) * deviations[:, 3:], axis=1)
     else:
-        radii = np.linalg.norm(arms - np.outer(arms @ axis, axis), axis=1)
-        if np.median(radii) < settings.least_radius:
-            return f"the target moves on a circle of {1000 * np.median(radii):.1f} mm about this joint's axis"
+        radius = float(np.median(np.linalg.norm(arms - np.outer(arms @ axis, axis), axis=1)))
+        if radius < settings.least_radius:
+            return f"the target moves on a circle of {1000 * radius:.1f} mm about this joint's axis"
         turned = np.array([turn_of_point(arms[middle], place, axis) for place in arms])
-        sds = np.maximum(np.sqrt(np.mean(deviations[:, :3] ** 2, axis=1)), _LEAST_SEEN_M) / np.median(radii)
+        sds = np.maximum(np.sqrt(np.mean(deviations[:, :3] ** 2, axis=1)), _LEAST_SEEN_M) / radius
     sds = np.hypot(sds, settings.rotation_sd)
-    sweep = _Sweep(servo, lines, by, poses, sds, axis, arms, stated, np.ones(len(lines), dtype=bool))
-    return _with_first_table(sweep, commanded[middle] + turned, stated)
-
-
-def _with_first_table(sweep: _Sweep, angles: Array, stated: Array) -> _Sweep | str:
-    """The table of least squares through angles (rad), near the stated one where none is."""
-    knots = sweep.known.angles
-    weight = 1e-3
-    rows = np.vstack(
-        [piecewise(knots, np.eye(len(knots)))(angles).reshape(-1, len(knots)), weight * np.eye(len(knots))]
-    )
-    sweep.pulses = np.linalg.lstsq(rows, np.concatenate([sweep.counts, weight * stated]), rcond=None)[0]
+    # Least squares through the angles, near the stated table where none is.
+    knots, weight = servo.angles, 1e-3
+    hats = piecewise(knots, np.eye(len(knots)))(commanded[middle] + turned).reshape(-1, len(knots))
+    rows, right = np.vstack([hats, weight * np.eye(len(knots))]), np.concatenate([counts, weight * stated])
+    first = np.linalg.lstsq(rows, right, rcond=None)[0]
+    sweep = _Sweep(servo, lines, by, poses, sds, axis, arms, first, np.ones(len(lines), dtype=bool), radius)
     return sweep if sweep.is_table else _NO_TABLE
 
 
@@ -314,7 +362,8 @@ class _TableFit:
         self._fit = BodyFit(experiment, arm, corrections, body, free, self._seen(), springs=has_springs)
         for joint in sweeps:
             self._fit.move(self._zero(joint), self._zeroed(joint))
-        self._compliances = [name for name in free if name.startswith(f"{arm.name}.") and self._is_compliance(name)]
+        names = [block.name for block in self._fit.parameters.blocks if block.unit == "rad_per_Nm" and block.size == 1]
+        self._compliances = [name for name in free if name.startswith(f"{arm.name}.") and name in names]
 
     def _zeroed(self, joint: str) -> float:
         """By how much the angles of a first table are beyond those by which its pulse at zero is the stated one (rad).
@@ -329,10 +378,6 @@ class _TableFit:
         beyond = float(piecewise(sweep.pulses[rising], knots[rising])(stated))
         sweep.pulses = np.asarray(piecewise(knots - beyond, sweep.pulses)(knots))
         return beyond
-
-    def _is_compliance(self, name: str) -> bool:
-        block = self._fit.parameters[name]
-        return block.unit == "rad_per_Nm" and block.size == 1
 
     def _free(
         self, experiment: Experiment, body: Body, corrections: Corrections, springs: bool
@@ -376,7 +421,7 @@ class _TableFit:
             ]
         )
 
-    def _seen(self) -> Seen:
+    def _seen(self) -> Dataset:
         joints = list(self._arm.commanded)
         rows: dict[str, list[Array]] = {joint: [] for joint in joints}
         sides: dict[str, list[Array]] = {joint: [] for joint in joints}
@@ -387,16 +432,11 @@ class _TableFit:
                 rows[other].append(sweep.angles if own else stood)
                 sides[other].append(sweep.approaches if own else np.zeros(len(stood)))
         sweeps = list(self._sweeps.values())
-        noise = np.concatenate([s.sds * self._length(s) for s in sweeps])
+        noise = np.concatenate([s.sds * s.radius for s in sweeps])
         numbers = np.repeat(np.arange(len(sweeps), dtype=float), [len(s.lines) for s in sweeps])
         angles, approaches = ({j: np.concatenate(parts) for j, parts in of.items()} for of in (rows, sides))
-        return Seen(angles, np.concatenate([s.poses for s in sweeps]), noise, approaches, numbers)
-
-    def _length(self, sweep: _Sweep) -> float:
-        """By which an angle about the joint becomes what is compared: a radius (m), or one."""
-        if sweep.by != "position":
-            return 1.0
-        return float(np.median(np.linalg.norm(sweep.arms - np.outer(sweep.arms @ sweep.axis, sweep.axis), axis=1)))
+        poses = np.concatenate([s.poses for s in sweeps])
+        return body_dataset(self._arm.name, angles, poses, (noise, noise), approaches, numbers)
 
     def _parts(self, rows: Array) -> dict[str, Array]:
         """Columns of all records, joint by joint."""

@@ -20,8 +20,8 @@ from armcal.config.servo_file import (
 )
 from armcal.io.plain_files import write_whole, writing
 
+from armcal_bench.servo.fit import FittedServo, Outcome
 from armcal_bench.servo.record import next_name
-from armcal_bench.servo.tables import FittedServo, Outcome
 
 _FAR_CHANGE = 0.1
 _SAG_WORTH = math.radians(0.1)

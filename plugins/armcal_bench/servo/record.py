@@ -22,8 +22,7 @@ from typing_extensions import override
 
 from armcal_bench.acquisition.run_log import LEFT_OUT as PASSED
 from armcal_bench.acquisition.run_log import MEASURED, Log, Progress
-from armcal_bench.servo.setup import Setup
-from armcal_bench.servo.tables import KnownServo
+from armcal_bench.servo.setup import KnownServo, Setup
 
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of entries
 

@@ -21,10 +21,10 @@ from armcal_bench.acquisition.run_log import NoLog, Progress
 from armcal_bench.acquisition.session import opened, ready_run
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested
 from armcal_bench.bench import closing
-from armcal_bench.joint_check import BASE, between, check_ended, turned_a_little
+from armcal_bench.joint_check import BASE, Verdict, answered, between, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
 from armcal_bench.measured_frame import FrameMistake
-from armcal_bench.servo.fit import outcome_of
+from armcal_bench.servo.fit import Outcome, outcome_of
 from armcal_bench.servo.record import (
     ANGLE,
     LEFT_OUT,
@@ -36,8 +36,6 @@ from armcal_bench.servo.record import (
     stated_by,
 )
 from armcal_bench.servo.setup import Conversation, PulsedJoints, ServoDevice, Setup
-from armcal_bench.servo.tables import Outcome
-from armcal_bench.servo.trial import Verdict, answered, noted, wrapped
 
 _FAR_GAIN = 8.0
 """Of lengths: in sweeps of one joint after the other a reversed servo resembles a frame with a smaller one."""
@@ -83,11 +81,6 @@ def evaluated(setup: Setup, folder: Path) -> Outcome:
     return outcome_of(record.entries, servos, clocks, setup.bench.experiment, setup.bench.arm, setup.settings)
 
 
-def adapter_of(folder: Path) -> str:
-    """The adapter that the record in a folder was measured on; empty if that is not known."""
-    return str((Record(folder).begun or {}).get("adapter", ""))
-
-
 def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int]]:
     """Counts and the sign of the pulses' change towards them: rising first, then falling.
 
@@ -130,7 +123,12 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
 
     def check(identity: DeviceIdentity) -> None:
         check_same(setup, record, identity)
-        _check_cools(setup)
+        rest = np.array([setup.base.get(joint, 0.0) for joint in device.joint_names])
+        hot = setup.heat.too_hot_for_ever(setup.heat.torques(rest), COOLED_TO)
+        if hot is not None:
+            named = f"the servo of {device.joint_names[hot]} would not cool in the base pose, by bench.acquisition.heat"
+            hint = "Give bench.servo.base a pose in which it carries less."
+            raise InputError(f"{named}; nothing was moved.", hint=hint)
 
     if set(poses) <= set(log.progress.measured):
         with closing(device):
@@ -149,20 +147,6 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
             hint = f"Correct that. Then give the same command: what was measured is kept as {kept}, and not used."
         raise InputError(f"{ending.sentence}.", where=Location(str(record.path)), hint=hint)
     check_ended(ending, log.progress, len(poses))
-
-
-def _check_cools(setup: Setup) -> None:
-    """Whether all servos cool where they are to rest.
-
-    Raises:
-        InputError: one does not.
-    """
-    joints = tuple(setup.bench.arm.commanded)
-    rest = np.array([setup.base.get(joint, 0.0) for joint in joints])
-    hot = setup.heat.too_hot_for_ever(setup.heat.torques(rest), COOLED_TO)
-    if hot is not None:
-        text = f"the servo of {joints[hot]} would not cool in the base pose, by bench.acquisition.heat"
-        raise InputError(f"{text}; nothing was moved.", hint="Give bench.servo.base a pose in which it carries less.")
 
 
 @contextmanager
@@ -363,11 +347,6 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
     Raises: as ``measure``.
     """
     record = WiringRecord.of_servo_file(setup.path, setup.file)
-    wrap = {joint: wrapped(joint, setup.file.servos[joint].angles, setup.ranges[joint]) for joint in setup.joints}
-    away = [verdict for verdict in wrap.values() if verdict is not None]
-    if away:  # by such a table no joint can be moved
-        noted(record, away, {})
-        return away
     tables = {joint: setup.table_of(joint) for joint in setup.base}
     turns = {joint: _small_turn(setup, joint) for joint in setup.joints}
     with setup.bench.clock() as clock:

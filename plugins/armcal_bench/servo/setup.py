@@ -30,6 +30,7 @@ from armcal.devices.wiring import servo_file_of
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
+from scipy.interpolate import BSpline, make_interp_spline
 from typing_extensions import override
 
 from armcal_bench.acquisition.drive import PathPlanner
@@ -42,8 +43,7 @@ from armcal_bench.acquisition.tracker_monitor import Waits
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.hazards import FirstMotion, HazardJudge
 from armcal_bench.keys import OperatorInput
-from armcal_bench.servo.rigid_arm import RigidArm
-from armcal_bench.servo.tables import KnownServo
+from armcal_bench.servo.tracked_body import RigidArm
 
 PositiveAngle = Annotated[Angle, Field(gt=0)]
 PositiveDuration = Annotated[Duration, Field(gt=0)]
@@ -122,6 +122,29 @@ class Conversation:
         """Those of a measuring run, of which a calibration is one."""
         stop, may = self.asked_to_stop, self.may_energise
         return RunOptions(Path(), "anew", stop, may, on_progress, unchecked=True, when_stopped="hold", waits=self.waits)
+
+
+@dataclass(frozen=True)
+class KnownServo:
+    """A servo as its table states it."""
+
+    joint: str  # that it turns
+    board: str  # that drives it
+    table: PulseTable  # as stated; pulses by the board's oscillator
+    knots: tuple[float, ...] = ()  # angles (rad) that the table is to be given at; empty: those of the stated one
+
+    @property
+    def angles(self) -> Array:
+        return np.array(self.knots or self.table.angles)
+
+    def pulses_at(self, angles: Array) -> Array:
+        """The stated table's pulses (s) at angles (rad)."""
+        return np.asarray(piecewise(np.array(self.table.angles), np.array(self.table.pulses))(angles))
+
+
+def piecewise(at: Array, values: Array) -> BSpline:
+    """Linear between points (``at`` rises), and beyond the ends as before them."""
+    return make_interp_spline(at, values, k=1)
 
 
 AT = (SECTION, "servo")
@@ -227,8 +250,8 @@ class Setup:
                     f"in the base pose {joint}, at {math.degrees(angle):.1f} deg, needs a pulse of {1e6 * pulse:.0f} "
                     f"us, expected {1e6 * shortest:.0f} to {1e6 * longest:.0f} us.",
                     where=where,
-                    hint="Choose another base pose, or widen bench.servo.pulses or the servo's pulse_range if the "
-                    "servo bears it.",
+                    hint="Choose another base pose; correct the servo's table, whose angles may lie a turn away; or "
+                    "widen bench.servo.pulses or its pulse_range if the servo bears it.",
                 )
             low, high = limits[joint]
             if not low <= angle <= high:

@@ -1,17 +1,23 @@
-"""Joints that stand off their commands, and a tracked body on the tool: what servo fits add to the arm's own problem.
+"""The tracked body on an arm's tool: the rigid arm that should carry it, and what servo fits add to the arm's problem.
 
 One problem of the arm's model serves all of them: pulse tables, backlash and springs of a calibration, and the zeros of
 servos that know where they stand.
 """
 
+from __future__ import annotations
+
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from armcal.arm.assembly import Arm, ArmState, prefixed, scoped
 from armcal.arm.effects import EffectSettings, JointCommand, JointEffect
+from armcal.arm.model import forward
 from armcal.arm.servo import piecewise_linear
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
@@ -24,7 +30,71 @@ from armcal.estimate.polish import descended
 from armcal.measure.measurement import Channel
 from armcal.problem.problem import PosedProblem, Problem
 from armcal.run.experiment import Experiment
+from scipy.spatial.transform import Rotation
 from typing_extensions import override
+
+Pose = Mapping[str, float]  # Joint angles (rad) by joint; those not named are zero
+
+
+def twist_angles(rotations: Rotation, axis: Array) -> Array:
+    """The angle about an axis (unit) of the rotation about it that is nearest to each (rad, within half a turn)."""
+    quaternions = rotations.as_quat()
+    angles = 2.0 * np.arctan2(quaternions[:, :3] @ axis, quaternions[:, 3])
+    return np.asarray((angles + math.pi) % (2 * math.pi) - math.pi)
+
+
+def turn_of_point(before: Array, after: Array, axis: Array) -> float:
+    """The turn (rad) about an axis (unit) through the origin that brings a point nearest to where it is after."""
+    flat, turned = (point - (point @ axis) * axis for point in (before, after))
+    return math.atan2(float(axis @ np.cross(flat, turned)), float(flat @ turned))
+
+
+def lever(vectors: Array, axis: Array) -> Array:
+    """By which shifts of points at ``vectors`` (N x 3, m) from an axis become turns about it (N x 3, rad/m)."""
+    arms = vectors - np.outer(vectors @ axis, axis)
+    return np.asarray(np.cross(axis, arms) / np.maximum(np.sum(arms**2, axis=1), 1e-12)[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class RigidArm:
+    """An arm whose joints stand where they are commanded."""
+
+    arm: Arm
+    parameters: Parameters  # whose nominal values are taken
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(self.arm.commanded)
+
+    def tool(self, pose: Pose) -> Array:
+        """``base_T_tool`` (4x4)."""
+        return np.asarray(self._function(self._commands(pose))[0].full())
+
+    def axis(self, joint: str, pose: Pose) -> tuple[Array, Array]:
+        """A joint's axis in the base frame: its direction (unit) and a point on it (m)."""
+        return self.axes(pose)[joint]
+
+    def axes(self, pose: Pose) -> dict[str, tuple[Array, Array]]:
+        _, axes, origins = (np.asarray(dm.full()) for dm in self._function(self._commands(pose)))
+        return {name: (axes[:, i], origins[:, i]) for i, name in enumerate(self.arm.joint_names)}
+
+    def _commands(self, pose: Pose) -> Array:
+        return np.array([float(pose.get(joint, 0.0)) for joint in self.joints])
+
+    @cached_property
+    def _function(self) -> ca.Function:
+        """Commands to the tool, and each joint's axis and origin."""
+        own = {block.name for block in self.arm.parameters()}
+        values = {b.name: ca.SX(list(b.nominal)) for b in self.parameters.blocks if b.name in own}
+        chain = self.arm.chain(values)
+        commands = ca.SX.sym("commands", len(self.joints))
+        displacements = self.arm.joint_commands(ca.vertsplit(commands))
+        frames = forward(chain, [joint.offset + displacements[i] for i, joint in enumerate(chain.joints)], {})
+        sites = frames.sites[1:]
+        axes = [ca.mtimes(s.rotation, ca.SX(list(j.axis))) for s, j in zip(sites, chain.joints, strict=True)]
+        out = [frames.base_T_tool.matrix(), ca.horzcat(*axes), ca.horzcat(*[s.origin for s in sites])]
+        return ca.Function("rigid", [commands], [ca.densify(x) for x in out], {"cse": True})
+
 
 By = Literal["rotation", "position", "pose"]  # What of the body is compared
 TABLES, BODY = "tables", "body"
@@ -131,29 +201,33 @@ class Body:
         return tuple((named[dimension],) for dimension in self.dimensions())
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """Records of a body: commanded angles and approaches by joint (N each), poses (N x 4 x 4) and their noise (N)."""
+def body_dataset(
+    arm: str,
+    angles: Mapping[str, Array],
+    poses: Array,
+    noise: tuple[Array, Array],
+    approaches: Mapping[str, Array] = MappingProxyType({}),
+    sweeps: Array | None = None,
+) -> Dataset:
+    """Records of a body.
 
-    angles: Mapping[str, Array]
-    poses: Array
-    noise: Array  # of the rotation about any axis (rad), or of each coordinate (m)
-    approaches: Mapping[str, Array] = field(default_factory=dict)
-    sweeps: Array | None = None  # the number of the sweep that each belongs to
-    place_noise: Array | None = None  # of each coordinate (m), where both are compared
-
-    def dataset(self, arm: str) -> Dataset:
-        count = len(self.poses)
-        channels = {f"{arm}.{joint}": angles for joint, angles in self.angles.items()}
-        channels |= {f"{arm}.approach.{joint}": approach for joint, approach in self.approaches.items()}
-        rotations = np.where(np.isnan(self.poses[:, :3, :3]), np.eye(3), self.poses[:, :3, :3])
-        quaternions = np.array([quaternion_of(rotation) for rotation in rotations])
-        channels |= {f"{BODY}.{axis}": self.poses[:, i, 3] for i, axis in enumerate("xyz")}
-        channels |= {f"{BODY}.{name}": quaternions[:, i] for i, name in enumerate(_QUATERNION)}
-        channels |= {f"{BODY}.sweep": np.zeros(count) if self.sweeps is None else self.sweeps}
-        noise = self.noise if self.place_noise is None else self.place_noise
-        channels |= {f"{BODY}.noise_rotation": self.noise, f"{BODY}.noise": noise}
-        return Dataset(tuple(str(i) for i in range(count)), channels)
+    Args:
+        arm: its name.
+        angles, approaches: commanded angles, and from where they came, by joint (N each).
+        poses: N x 4 x 4.
+        noise: of the rotation about any axis (rad), and of each coordinate (m) (N each).
+        sweeps: the number of the sweep that each belongs to (N).
+    """
+    count = len(poses)
+    channels = {f"{arm}.{joint}": values for joint, values in angles.items()}
+    channels |= {f"{arm}.approach.{joint}": approach for joint, approach in approaches.items()}
+    rotations = np.where(np.isnan(poses[:, :3, :3]), np.eye(3), poses[:, :3, :3])
+    quaternions = np.array([quaternion_of(rotation) for rotation in rotations])
+    channels |= {f"{BODY}.{axis}": poses[:, i, 3] for i, axis in enumerate("xyz")}
+    channels |= {f"{BODY}.{name}": quaternions[:, i] for i, name in enumerate(_QUATERNION)}
+    channels |= {f"{BODY}.sweep": np.zeros(count) if sweeps is None else sweeps}
+    channels |= {f"{BODY}.noise_rotation": noise[0], f"{BODY}.noise": noise[1]}
+    return Dataset(tuple(str(i) for i in range(count)), channels)
 
 
 class BodyFit:
@@ -163,6 +237,7 @@ class BodyFit:
         experiment: whose arm it is, at its parameters' nominal values.
         corrections, body: what is added to it.
         free: what may move, with the standard deviations about where it starts; None for no prior.
+        dataset: see ``body_dataset``.
         springs: whether the arm's springs give.
     """
 
@@ -173,11 +248,11 @@ class BodyFit:
         corrections: Corrections,
         body: Body,
         free: Mapping[str, float | None],
-        seen: Seen,
+        dataset: Dataset,
         *,
         springs: bool = True,
     ) -> None:
-        self._arm, environment = arm.name, experiment.system.environment
+        environment = experiment.system.environment
         nominal = {block.name: ca.SX(list(block.nominal)) for block in arm.parameters()}
         own = {n: e for n, e in arm.effects.items() if springs and e.springs(scoped(nominal, f"{arm.name}.{n}."))}
         arm = replace(arm, effects={**own, TABLES: corrections}, residual=None)
@@ -188,7 +263,6 @@ class BodyFit:
         ]
         fixed = [replace(b, free=b.name in free, prior_sd=free.get(b.name), drift=None) for b in blocks]
         parameters = Parameters(tuple(block for block in fixed if not block.nuisance))
-        dataset = seen.dataset(arm.name)
         arms, measurements = {arm.name: arm}, {BODY: body}
         self.problem = Problem.build(arms, measurements, parameters, environment, dataset, "interpreted")
         self.values = parameters.nominal()
@@ -197,13 +271,13 @@ class BodyFit:
     def parameters(self) -> Parameters:
         return self.problem.parameters
 
-    def fit(self, seen: Seen, weights: Array) -> None:
+    def fit(self, dataset: Dataset, weights: Array) -> None:
         """To records like those that it was built with, from where the last fit ended.
 
         Raises:
             NotConvergedError: a record has no elastic equilibrium.
         """
-        self.problem = self.problem.of(seen.dataset(self._arm), weights)
+        self.problem = self.problem.of(dataset, weights)
         posed = PosedProblem(self.problem)
         self.values = posed.values(descended(posed, posed.x(self.values), _MOST_STEPS, _DAMPING, _AT_REST))
 
