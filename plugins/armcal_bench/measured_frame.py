@@ -82,7 +82,7 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
         other = _fitted(expected, seen, gain, mirror, rotations)
         enough = min(FITS * spread, straight[rotations].left / MUCH_BETTER)
         gains = (other.gain, moved / spread if spread else np.inf)
-        is_gain = other.gain > _LEAST_GAIN and not any(1 / _GAIN_OFF < each < _GAIN_OFF for each in gains)
+        is_gain = other.gain > _LEAST_GAIN and not any(1 / _GAIN_OFF < ratio < _GAIN_OFF for ratio in gains)
         if gain is None and not (shows_gain and is_gain):
             continue
         if other.left <= enough * (1 if other.is_mirrored else _ROUGHLY):

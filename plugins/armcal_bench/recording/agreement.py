@@ -398,7 +398,7 @@ class Assessor:
                 lines.insert(0, f"{UNSEEN_SCALE}; {GIVE_A_LENGTH}")
         except _UNFIT as fault:
             return (str(fault),)
-        return (*lines, *(f"{each}: hardly determined (sd {sd:.2g} typical scales)" for each, sd in known.hardly))
+        return (*lines, *(f"{name}: hardly determined (sd {sd:.2g} typical scales)" for name, sd in known.hardly))
 
     def _known(self, experiment: Experiment, problem: Problem, dataset: Dataset) -> Knowledge:
         train = _training(experiment, dataset)
