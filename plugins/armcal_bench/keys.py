@@ -30,22 +30,11 @@ RECORDING_KEYS: Mapping[str, str] = {
 _NAME = "g"
 
 
-@contextmanager
-def single_keys(descriptor: int) -> Iterator[None]:
-    before = termios.tcgetattr(descriptor)
-    try:
-        tty.setcbreak(descriptor, termios.TCSANOW)
-        yield
-    finally:
-        with suppress(termios.error):  # the terminal may be gone
-            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
-
-
 class OperatorInput:
     """Words in the order in which they are typed.
 
     Args:
-        descriptor: of a terminal (in the mode of ``single_keys``) or a pipe; None: nobody can type.
+        descriptor: of a terminal (that gives single keys) or a pipe; None: nobody can type.
         keys: of a terminal, what each key stands for; None: a word a line.
         at_end: the word that the end of the input stands for, if any.
         echo: shows text where a name is typed; None: no key begins a name.
@@ -144,10 +133,20 @@ class OperatorInput:
 
 
 @contextmanager
-def servo_input(descriptor: int) -> Iterator[OperatorInput]:
-    """For a guided calibration: keys where a terminal is, whose mode is put back whatever happens; else lines."""
-    if not os.isatty(descriptor):
-        yield OperatorInput(descriptor, at_end=QUIT)
+def operator_input(
+    descriptor: int | None,
+    keys: Mapping[str, str],
+    at_end: str | None = None,
+    echo: Callable[[str], None] | None = None,
+) -> Iterator[OperatorInput]:
+    """Keys where a terminal is, whose mode is put back whatever happens; else lines. See ``OperatorInput``."""
+    if descriptor is None or not os.isatty(descriptor):
+        yield OperatorInput(descriptor, at_end=at_end)
         return
-    with single_keys(descriptor):
-        yield OperatorInput(descriptor, SERVO_KEYS, QUIT)
+    before = termios.tcgetattr(descriptor)
+    try:
+        tty.setcbreak(descriptor, termios.TCSANOW)
+        yield OperatorInput(descriptor, keys, at_end, echo)
+    finally:
+        with suppress(termios.error):  # the terminal may be gone
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from armcal.errors import DataError, InputError
 from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.keys import QUIT, OperatorInput, servo_input
+from armcal_bench.keys import QUIT, SERVO_KEYS, OperatorInput, operator_input
 from armcal_bench.servo.outputs import improved
 from armcal_bench.servo.record import Record
 from armcal_bench.servo.session import evaluated, measure
@@ -163,7 +163,7 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
     master, slave = os.openpty()
     try:
         before = termios.tcgetattr(slave)
-        with pytest.raises(RuntimeError), servo_input(slave) as wishes:
+        with pytest.raises(RuntimeError), operator_input(slave, SERVO_KEYS, QUIT) as wishes:
             assert not termios.tcgetattr(slave)[3] & (termios.ICANON | termios.ECHO)
             os.write(master, b"\x1b[A\x1b[B\x1b[5~x\x1b[6~\rsbq")
             assert [wishes.next(1.0) for _ in range(8)] == ["+1", "-1", "+10", "-10", "ok", "skip", "back", "quit"]
@@ -174,7 +174,7 @@ def test_keys_of_a_real_terminal_and_its_mode_put_back():
             assert wishes.next(5.0) == "+1"  # a key that comes in pieces
             raise RuntimeError
         assert termios.tcgetattr(slave) == before
-        with servo_input(slave) as wishes:
+        with operator_input(slave, SERVO_KEYS, QUIT) as wishes:
             os.close(master)
             master = -1
             assert wishes.next(1.0) == "quit"  # nobody is there any more

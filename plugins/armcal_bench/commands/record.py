@@ -23,7 +23,7 @@ from armcal.version import JSON_SCHEMA
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.commands.common import FILE, load, on_bench
 from armcal_bench.journal_folder import Start
-from armcal_bench.keys import RECORDING_KEYS, OperatorInput, single_keys
+from armcal_bench.keys import RECORDING_KEYS, OperatorInput, operator_input
 from armcal_bench.recording.postures import DATASET, IMAGES
 from armcal_bench.recording.recorder import KEYS, LOOK, Message, record
 
@@ -112,29 +112,23 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[OperatorInput, bool]]:
     Raises:
         InputError: no key could start a capture.
     """
-    is_taken = (bench.settings.joints or {}).get("source") == STANDARD_INPUT
-    if not is_taken and not sys.stdin.isatty():
-        yield OperatorInput(sys.stdin.fileno()), False
-        return
-    descriptor = None
-    if not is_taken:
-        descriptor = os.dup(sys.stdin.fileno())
-    elif sys.stderr.isatty():  # somebody looks at it
-        with suppress(OSError):
-            descriptor = os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
-    if descriptor is None:
-        if capture == "keys":
+    if (bench.settings.joints or {}).get("source") != STANDARD_INPUT:
+        descriptor, opened = sys.stdin.fileno(), None
+    else:
+        descriptor = opened = None
+        if sys.stderr.isatty():  # somebody looks at it
+            with suppress(OSError):
+                descriptor = opened = os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
+        if opened is None and capture == "keys":
             raise InputError(
                 "standard input gives the joint readings and there is no terminal, so no key can start a capture.",
                 hint="Give --capture still, or let the readings come from udp:PORT or a file.",
             )
-        yield OperatorInput(None), False
-        return
     try:
-        with single_keys(descriptor):
-            yield (
-                OperatorInput(descriptor, RECORDING_KEYS, echo=lambda text: click.echo(text, err=True, nl=False)),
-                True,
-            )
+        with operator_input(
+            descriptor, RECORDING_KEYS, echo=lambda text: click.echo(text, err=True, nl=False)
+        ) as operator:
+            yield operator, descriptor is not None and os.isatty(descriptor)
     finally:
-        os.close(descriptor)
+        if opened is not None:
+            os.close(opened)

@@ -21,7 +21,7 @@ from armcal.report.document import Document, Section, Table
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.commands.common import FILE, Question, energise_option, load, on_bench, waits, warned
 from armcal_bench.joint_check import Verdict, check_joints, swapped
-from armcal_bench.keys import servo_input
+from armcal_bench.keys import QUIT, SERVO_KEYS, operator_input
 from armcal_bench.servo.outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo.record import Record
 from armcal_bench.servo.session import evaluated, measure, park, tried
@@ -61,7 +61,7 @@ def servo(
             may_energise=warned(console, may_energise),
             report=lambda joint, done, planned: show(f"measuring {joint}", done / max(planned, 1)),
             say=partial(say, err=console.json),
-            wishes=lambda: servo_input(0),
+            wishes=lambda: operator_input(0, SERVO_KEYS, QUIT),
             waits=waits(console),
         )
         if setup is None:

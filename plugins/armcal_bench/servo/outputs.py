@@ -6,18 +6,12 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from armcal.arm.servo import PulseTable
 from armcal.base.config_text import finite
-from armcal.config.servo_file import (
-    BoardSettings,
-    ServoFile,
-    ServoSettings,
-    load_servo_file,
-    servo_file_text,
-)
+from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
 from armcal.io.plain_files import write_whole, writing
 
 from armcal_bench.servo.fit import FittedServo, Outcome
@@ -115,7 +109,6 @@ def _of_springs(outcome: Outcome) -> list[str]:
 
 RESULTS = "servo.json"
 _APART = math.radians(0.5)  # Knots that are nearer to the end of a shortened table add nothing
-Part = TypeVar("Part", BoardSettings, ServoSettings)
 
 
 def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
@@ -124,13 +117,14 @@ def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
     Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
     part is kept whose pulses its servo bears.
     """
-    boards = {name: board if board.id else _changed(board, id=adapter) for name, board in file.boards.items()}
-    servos: dict[str, ServoSettings] = {}
+    stated = {"id": adapter}
+    boards = {name: board if board.id else board.model_copy(update=stated) for name, board in file.boards.items()}
+    servos = dict(file.servos)
     for joint, servo in file.servos.items():
         fitted_servo = outcome.servos.get(joint)
         table = None if fitted_servo is None else _fitted_table(fitted_servo, servo, outcome, boards[servo.board])
-        table = table or servo.table
-        servos[joint] = _changed(servo, angles=table.angles, pulses=table.pulses)
+        if table is not None:
+            servos[joint] = servo.model_copy(update={"angles": table.angles, "pulses": table.pulses})
     return ServoFile(boards, servos)
 
 
@@ -159,11 +153,6 @@ def _borne_part(table: PulseTable, servo: ServoSettings, board: BoardSettings) -
     pairs = list(zip(table.angles, table.pulses, strict=True))
     inner = [(a, p) for a, p in pairs if low < p < high and ends[0][0] + _APART < a < ends[1][0] - _APART]
     return PulseTable(*map(tuple, zip(ends[0], *inner, ends[1], strict=True)))
-
-
-def _changed(part: Part, **values: Any) -> Part:
-    stated = {name: getattr(part, name) for name in part.model_fields_set}
-    return type(part).si(**{**stated, **values})
 
 
 def write_servo_file(path: Path, file: ServoFile) -> Path | None:
