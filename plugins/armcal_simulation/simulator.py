@@ -29,6 +29,7 @@ from armcal.problem.variants import as_seen
 from pydantic import Field
 
 _MOST_DRAWS = 100
+_QUATERNION = ("qw", "qx", "qy", "qz")
 
 
 class PoseSettings(Settings):
@@ -123,7 +124,7 @@ class ElasticArmSimulator:
         arm = next(iter(request.arms.values()))
         named = [*arm.command_channels]
         given, true = request.poses, at_truth(request, settings.truth)
-        commands = _in_view(true, settings.poses, arm, random) if given is None else given.stacked(named)
+        commands = _commands_in_view(true, settings.poses, arm, random) if given is None else given.stacked(named)
         reached = self._reached(arm, commands)
         approach = approach_of(commands)
         channels = {f"{arm.name}.approach.{j}": approach[i] for i, j in enumerate(arm.commanded)}
@@ -133,10 +134,15 @@ class ElasticArmSimulator:
             standing = Dataset(ids, {**moved_to, **channels}, source="simulation")
         else:
             standing = replace(given, channels={**channels, **given.channels, **moved_to}, source="simulation")
-        exact = measured_without_noise(true, standing)
-        read = disturbed(true, standing, exact, settings.noise, random)
-        read = {**read, **out_of_view(true, with_channels(standing, read))}
-        moved = {channel: values for channel, values in read.items() if not is_orientation(channel)}
+        read = measured_with_noise(true, standing, measured_without_noise(true, standing), random, settings.noise)
+        for name in request.measurements:
+            parts = [f"{name}.{part}" for part in _QUATERNION]
+            if set(parts) <= read.keys():
+                length = np.linalg.norm([read[part] for part in parts], axis=0)
+                read |= {part: read[part] / length for part in parts}
+        seen = _in_view(true, with_channels(standing, read))[0].channels  # NaN where an instrument sees nothing
+        read = {channel: seen[channel] for channel in read}
+        moved = {channel: values for channel, values in read.items() if channel.rpartition(".")[2] not in _QUATERNION}
         pushed, _ = with_outliers(moved, settings.outliers, random)
         return with_channels(standing, {**dict(zip(named, commands, strict=True)), **read, **pushed})
 
@@ -155,19 +161,26 @@ class ElasticArmSimulator:
         return reached
 
 
-def _in_view(true: SimulationRequest, poses: PoseSettings, arm: Arm, random: np.random.Generator) -> Array:
+def _commands_in_view(true: SimulationRequest, poses: PoseSettings, arm: Arm, random: np.random.Generator) -> Array:
     """Commands (joints x poses) in which an instrument sees something; drawn again until there are enough.
 
     Raises:
         ConfigError: hardly any pose is one.
     """
+
+    def seen(commands: Array) -> Mask:
+        if not any(isinstance(measurement, LimitedView) for measurement in true.measurements.values()):
+            return np.ones(commands.shape[1], dtype=bool)
+        moved = dict(zip(arm.command_channels, commands, strict=True))
+        return _in_view(true, Dataset(tuple(map(str, range(commands.shape[1]))), moved))[1]
+
     commands = poses.commands(arm, random)
-    kept = commands[:, seen_poses(true, arm, commands)]
+    kept = commands[:, seen(commands)]
     for _ in range(_MOST_DRAWS):
         if kept.shape[1] >= poses.count:
             break
         more = poses.commands(arm, random)
-        kept = np.unique(np.hstack([kept, more[:, seen_poses(true, arm, more)]]), axis=1)
+        kept = np.unique(np.hstack([kept, more[:, seen(more)]]), axis=1)
     if kept.shape[1] < poses.count:
         raise ConfigError(
             f"simulation.poses: in {kept.shape[1]} of {(_MOST_DRAWS + 1) * poses.count} poses drawn an instrument sees "
@@ -177,50 +190,8 @@ def _in_view(true: SimulationRequest, poses: PoseSettings, arm: Arm, random: np.
     return np.asarray(kept[:, : poses.count])
 
 
-_QUATERNION = ("qw", "qx", "qy", "qz")
-
-
-def disturbed(
-    request: SimulationRequest,
-    commands: Dataset,
-    exact: Mapping[str, Array],
-    stated: float | None,
-    random: np.random.Generator,
-) -> dict[str, Array]:
-    """Readings by channel (N each) with Gaussian noise, as declared, or ``stated`` (m) on all that are lengths.
-
-    Raises:
-        ProblemError: the residual of a measurement depends on something else than its readings.
-    """
-    readings = measured_with_noise(request, commands, exact, random, stated)
-    for name in request.measurements:
-        parts = [f"{name}.{part}" for part in _QUATERNION]
-        if set(parts) <= readings.keys():
-            length = np.linalg.norm([readings[part] for part in parts], axis=0)
-            readings |= {part: readings[part] / length for part in parts}
-    return readings
-
-
-def is_orientation(channel: str) -> bool:
-    return channel.rpartition(".")[2] in _QUATERNION
-
-
-def out_of_view(request: SimulationRequest, dataset: Dataset) -> dict[str, Array]:
-    """Readings of instruments with a limited view, by channel (N each), missing (NaN) where it is out of view."""
-    seen, _ = as_seen(*_as_built(request, dataset), dataset)
-    return {channel: values for channel, values in seen.channels.items() if values is not dataset.channels[channel]}
-
-
-def seen_poses(request: SimulationRequest, arm: Arm, commands: Array) -> Mask:
-    """In which of these commands of an arm (joints x N) an instrument sees anything (N)."""
-    if not any(isinstance(measurement, LimitedView) for measurement in request.measurements.values()):
-        return np.ones(commands.shape[1], dtype=bool)
-    moved = {f"{arm.name}.{joint}": row for joint, row in zip(arm.commanded, commands, strict=True)}
-    dataset = Dataset(tuple(map(str, range(commands.shape[1]))), moved)
-    return as_seen(*_as_built(request, dataset), dataset)[1]
-
-
-def _as_built(request: SimulationRequest, dataset: Dataset) -> tuple[Problem, Array]:
+def _in_view(request: SimulationRequest, dataset: Dataset) -> tuple[Dataset, Mask]:
+    """Records without what instruments of a limited view do not see, and in which of them any sees anything (N)."""
     fixed = request.parameters.with_free(())
     parts = (request.arms, request.measurements, fixed, request.environment, dataset)
-    return Problem.build(*parts, evaluator="interpreted"), fixed.nominal()
+    return as_seen(Problem.build(*parts, evaluator="interpreted"), fixed.nominal(), dataset)

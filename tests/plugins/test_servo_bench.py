@@ -437,13 +437,13 @@ class TestFaults:
     @pytest.mark.parametrize(
         ("fault", "said"),
         [
-            ({"kind": "unplg", "at": 5}, "kind 'unplg', .* did you mean unplug"),
-            ({"kind": "lost", "body": "tol"}, "body 'tol', .* did you mean tool"),
-            ({"kind": "brown_out", "joint": "qq3"}, "joint 'qq3', .* did you mean q3"),
-            ({"kind": "jam", "joint": "q3"}, "kind 'jam', .* expected one of drop"),
+            ({"kind": "unplg", "at": 5}, "kind 'unplg', expected one of drop"),
+            ({"kind": "lost", "body": "tol"}, "body 'tol', expected one of base, tool"),
+            ({"kind": "brown_out", "joint": "qq3"}, "no joint is called 'qq3'"),
+            ({"kind": "jam", "joint": "q3"}, "kind 'jam', expected one of drop"),
         ],
     )
-    def test_a_misspelt_fault_is_refused_with_the_nearest_name(self, make: Make, fault: Any, said: str) -> None:
+    def test_a_misspelt_fault_is_refused_with_the_names_that_there_are(self, make: Make, fault: Any, said: str) -> None:
         with pytest.raises(ValueError, match=said):
             make().world.answer({"fault": fault})
 

@@ -14,9 +14,8 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.physics import ElasticPose
-from armcal_simulation.bench.servo_model import ServoHeat, ServoJointSettings, ServoModel
-from armcal_simulation.bench.truth import BenchTruthSettings, tracked_arm
+from armcal_simulation.bench.servo_model import JointServo, ServoHeat, ServoJointSettings
+from armcal_simulation.bench.world import BenchTruthSettings, TrackedArm
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,7 +31,7 @@ def at(angle: float) -> float:
     return float(TABLE.pulse(angle))
 
 
-def driven(servo: ServoModel, angle: float, seconds: float = 2.0, torque: float = 0.0) -> float:
+def driven(servo: JointServo, angle: float, seconds: float = 2.0, torque: float = 0.0) -> float:
     servo.command(at(angle))
     servo.advance(seconds, torque)
     return servo.angle
@@ -41,21 +40,21 @@ def driven(servo: ServoModel, angle: float, seconds: float = 2.0, torque: float 
 class TestServo:
     @given(st.floats(-1.9, 1.9))
     def test_angles_of_pulses_are_those_of_the_table(self, angle: float) -> None:
-        assert ServoModel(PLAIN, TABLE, 0.0).angle_of(at(angle)) == pytest.approx(angle, abs=1e-12)
+        assert JointServo(PLAIN, 0.0, TABLE).angle_of(at(angle)) == pytest.approx(angle, abs=1e-12)
 
     def test_a_falling_table_is_read_as_well(self) -> None:
         falling = PulseTable(TABLE.angles, TABLE.pulses[::-1])
-        assert ServoModel(PLAIN, falling, 0.0).angle_of(float(falling.pulse(0.8))) == pytest.approx(0.8)
+        assert JointServo(PLAIN, 0.0, falling).angle_of(float(falling.pulse(0.8))) == pytest.approx(0.8)
 
     def test_it_moves_at_its_speed_and_stops_where_it_is_told(self) -> None:
-        servo = ServoModel(PLAIN, TABLE, 0.0)
+        servo = JointServo(PLAIN, 0.0, TABLE)
         assert driven(servo, 1.0, 0.1) == pytest.approx(0.5)
         assert driven(servo, 1.0, 0.1) == pytest.approx(1.0)
         assert not servo.advance(1.0, 0.0)
 
     @given(st.lists(st.floats(0.001, 0.2), min_size=1, max_size=20))
     def test_the_way_time_is_cut_up_changes_nothing(self, steps: Sequence[float]) -> None:
-        whole, cut = (ServoModel(PLAIN.model_copy(update={"backlash": 0.02}), TABLE, 0.0) for _ in range(2))
+        whole, cut = (JointServo(PLAIN.model_copy(update={"backlash": 0.02}), 0.0, TABLE) for _ in range(2))
         driven(whole, 1.5, sum(steps))
         for step in steps:
             driven(cut, 1.5, step)
@@ -63,7 +62,7 @@ class TestServo:
 
     @given(st.floats(-1.5, 1.5), st.floats(0.0, 0.1))
     def test_both_sides_of_an_angle_differ_by_the_backlash(self, angle: float, gap: float) -> None:
-        servo = ServoModel(PLAIN.model_copy(update={"backlash": gap}), TABLE, 0.0)
+        servo = JointServo(PLAIN.model_copy(update={"backlash": gap}), 0.0, TABLE)
         driven(servo, angle - 0.3)
         below = driven(servo, angle)
         driven(servo, angle + 0.3)
@@ -72,39 +71,39 @@ class TestServo:
         assert (above + below) / 2 == pytest.approx(angle, abs=1e-9)
 
     def test_a_move_within_the_play_moves_the_gear_only(self) -> None:
-        servo = ServoModel(PLAIN.model_copy(update={"backlash": 0.1}), TABLE, 0.0)
+        servo = JointServo(PLAIN.model_copy(update={"backlash": 0.1}), 0.0, TABLE)
         driven(servo, 1.0)
         assert driven(servo, 0.95) == pytest.approx(0.95)
         assert driven(servo, 0.99) == pytest.approx(0.95)
 
     def test_errors_within_the_dead_band_do_not_make_it_move(self) -> None:
-        servo = ServoModel(PLAIN.model_copy(update={"dead_band": 0.01}), TABLE, 0.0)
+        servo = JointServo(PLAIN.model_copy(update={"dead_band": 0.01}), 0.0, TABLE)
         assert driven(servo, 0.009) == 0.0
         assert driven(servo, 0.05) == pytest.approx(0.05), "once it moves it goes all the way"
 
     def test_it_stays_within_its_stops(self) -> None:
-        assert driven(ServoModel(PLAIN, TABLE, 0.0), 2.5) == pytest.approx(2.0)
+        assert driven(JointServo(PLAIN, 0.0, TABLE), 2.5) == pytest.approx(2.0)
 
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_without_pulses_it_falls_with_its_load_down_to_a_stop(self, sign: int) -> None:
-        servo = ServoModel(PLAIN, TABLE, 0.5)
+        servo = JointServo(PLAIN, 0.5, TABLE)
         servo.advance(0.5, sign * LOAD)
         assert servo.angle == pytest.approx(0.5 + sign * 0.5)
         servo.advance(10.0, sign * LOAD)
         assert servo.angle == pytest.approx(sign * 2.0) and servo.rests(sign * LOAD)
 
     def test_without_pulses_its_friction_holds_a_light_load(self) -> None:
-        servo = ServoModel(PLAIN, TABLE, 0.5)
+        servo = JointServo(PLAIN, 0.5, TABLE)
         assert not servo.advance(1.0, 0.04) and servo.angle == 0.5
 
     def test_with_pulses_it_holds_its_load_up_to_the_stall_torque(self) -> None:
-        servo = ServoModel(PLAIN, TABLE, 0.0)
+        servo = JointServo(PLAIN, 0.0, TABLE)
         assert driven(servo, 1.0, torque=1.9) == pytest.approx(1.0)
         servo.advance(0.1, -2.1)
         assert servo.angle == pytest.approx(0.9)
 
     def test_a_burnt_servo_holds_nothing(self) -> None:
-        servo = ServoModel(PLAIN, TABLE, 0.0)
+        servo = JointServo(PLAIN, 0.0, TABLE)
         servo.failed = True
         driven(servo, 1.0, 0.1, -LOAD)
         assert servo.angle == pytest.approx(-0.1)
@@ -197,7 +196,7 @@ def bench_settings(truth: Path, **given: object) -> BenchTruthSettings:
 
 class TestElasticPose:
     def test_it_is_where_the_simulator_of_datasets_has_it(self, experiment: Experiment, truth: Path) -> None:
-        pose = ElasticPose(tracked_arm(bench_settings(truth), experiment))
+        pose = TrackedArm(bench_settings(truth), experiment).pose
         angles = np.random.default_rng(3).uniform(-1.5, 1.5, (6, 20))
         source, system = load_config(truth), experiment.system
         true = with_values(experiment.parameters, source.data, source, ())
@@ -209,7 +208,7 @@ class TestElasticPose:
         assert np.abs(found - expected).max() < 1e-7
 
     def test_it_does_not_hang_on_where_the_arm_was_before(self, experiment: Experiment, truth: Path) -> None:
-        pose = ElasticPose(tracked_arm(bench_settings(truth), experiment))
+        pose = TrackedArm(bench_settings(truth), experiment).pose
         angles = np.random.default_rng(4).uniform(-1.5, 1.5, (30, 6))
         forwards = [pose(q, np.zeros(6)) for q in angles]
         backwards = [pose(q, np.zeros(6)) for q in angles[::-1]][::-1]
@@ -219,4 +218,4 @@ class TestElasticPose:
 
     def test_an_effect_that_is_not_there_cannot_be_left_out(self, experiment: Experiment, truth: Path) -> None:
         with pytest.raises(ConfigError, match="no effect of arm is called 'counts'"):
-            tracked_arm(bench_settings(truth, without_effects=["counts"]), experiment)
+            TrackedArm(bench_settings(truth, without_effects=["counts"]), experiment)

@@ -11,8 +11,8 @@ from armcal.arm.servo import SPLINE_TEETH
 from armcal.devices.simulated import BenchRequest, RunningBench, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.safety import Commit, SafetySettings
-from armcal_simulation.bench.truth import ALL, bounds_of, tracked_arm
+from armcal_simulation.bench.safety import SafetySettings
+from armcal_simulation.bench.world import ALL, TrackedArm
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
 
@@ -101,7 +101,7 @@ class BusWorld(LineWorld):
     )  # fmt: skip
 
     def __init__(self, settings: BusBenchSettings, experiment: Experiment, folder: Path) -> None:
-        tracked = tracked_arm(settings, experiment)
+        tracked = TrackedArm(settings, experiment)
         names = list(tracked.arm.commanded)
         if fault := unknown_joint([joint for joint in (*settings.joints, *settings.start) if joint != ALL], names):
             raise ConfigError(f"bench.simulator: {fault}.")
@@ -111,13 +111,13 @@ class BusWorld(LineWorld):
         random = np.random.default_rng([settings.seed, 2])
         self._servos = {joint: _bus_servo(settings, joint, random) for joint in names}
         motors = {joint: servo.motor for joint, servo in self._servos.items()}
-        super().__init__(settings, tracked, motors, bounds_of(experiment, None), folder)
+        super().__init__(settings, tracked, motors, None, folder)
         supply, chain = (settings.supply_V, settings.supply_ohm), list(self._servos.values())
-        self._bus = ServoBus(self.clock, chain, self.send, self.baud, random, echo=settings.echo, supply=supply)
+        self._bus = ServoBus(self.time, chain, self.send, self.baud, random, echo=settings.echo, supply=supply)
         self.split = self._bus.split
         self._setpoints: dict[str, float | None] = dict.fromkeys(names)
         for joint, servo in self._servos.items():
-            servo.heat = lambda heat=self.physics.heat[joint]: heat.winding  # type: ignore[misc]
+            servo.heat = lambda heat=self.heat[joint]: heat.winding  # type: ignore[misc]
 
     @override
     def boot(self) -> None:
@@ -128,7 +128,7 @@ class BusWorld(LineWorld):
     def receive(self, data: bytes) -> None:
         self._bus.receive(data)
         self.moved()
-        self.physics.commands_changed()
+        self.commands_changed()
 
     @override
     def next_event(self) -> float:
@@ -138,7 +138,7 @@ class BusWorld(LineWorld):
     def run_timers(self) -> None:
         self._bus.run_timers()
         self.moved()
-        self.physics.commands_changed()
+        self.commands_changed()
 
     @override
     def moved(self) -> None:
@@ -146,8 +146,7 @@ class BusWorld(LineWorld):
             before, now = self._setpoints[joint], servo.motor.setpoint
             if before != now:
                 self._setpoints[joint] = now
-                commit = Commit(self.now, before, now, _TURN / 4096)
-                self.safety.committed(joint, commit, self.physics.torques[joint])
+                self.safety.committed(joint, self.now, before, now, _TURN / 4096, self.torques[joint])
 
     @override
     def fail(self, fault: Any) -> None:
@@ -167,9 +166,9 @@ class BusWorld(LineWorld):
             elif fault.kind == "put":
                 servo.motor.put(fault.angle)
             elif fault.kind == "heat":
-                self.physics.heat[joint].winding = _BURNING
+                self.heat[joint].winding = _BURNING
         self.moved()
-        self.physics.commands_changed()
+        self.commands_changed()
         super().fail(fault)
 
     @override

@@ -8,15 +8,14 @@ import math
 from typing import Annotated
 
 from armcal.base.settings import Torque
-from armcal_simulation.bench.servo_model import JointServo, Positive
-from armcal_simulation.bench.truth import BenchJointSettings
+from armcal_simulation.bench.servo_model import JointServo, Positive, ServoJointSettings
 from pydantic import Field
 from typing_extensions import override
 
 _NEAR = 1e-9
 
 
-class BusMotorSettings(BenchJointSettings):
+class BusMotorSettings(ServoJointSettings):
     """What kind of motor it is, beside what all servos have; by default an STS3215 at 7.4 V.
 
     ``stall_A`` is what it draws at ``stall``; ``rise_K`` how much warmer its sensor is than the air when its winding
@@ -79,7 +78,7 @@ class BusMotor(JointServo):
     def energise(self, on: bool) -> None:
         """Hold where it stands, or let go."""
         if on and self.setpoint is None:
-            self.goal = self.setpoint = self._gear
+            self.goal = self.setpoint = self.shaft
             self._profile_speed = 0.0
         elif not on:
             self.setpoint = None

@@ -82,7 +82,7 @@ class SimulatedDTrack:
 
     def __init__(self, settings: DTrackSenderSettings, host: str, port: int, seed: int) -> None:
         self._model = TrackerModel(settings, tuple(settings.bodies), np.random.default_rng(seed))
-        self._sender, self.faults = DTrackSender(settings, host, port), self._model.faults
+        self._sender, self.faults = DTrackSender(settings, host, port), self._model
 
     def send(self, now: float, bodies: Mapping[str, Array | None]) -> None:
         """A moment (unix s), and ``world_T_body`` (4 x 4, m) by name; None: out of sight."""

@@ -10,19 +10,17 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from armcal.arm.joints import unknown_joint
+from armcal.config.servo_file import ServoFile
 from armcal.devices.clock import Clock
 from armcal.devices.device import JointDevice
 from armcal.devices.live import JointStream, Tracker, TrackerFrame
 from armcal.devices.simulated import LOG, BenchRequest, RunningBench
 from armcal.io.json_server import JsonServer, vacate
 from armcal.io.signals import Signals
-from armcal_simulation.bench.faults import FaultRequest
-from armcal_simulation.bench.physics import TrackedArm
-from armcal_simulation.bench.safety import Bounds, appended_to
 from armcal_simulation.bench.servo_model import JointServo
-from armcal_simulation.bench.truth import BenchTruthSettings
-from armcal_simulation.bench.world import WALL_AT_START, BenchWorld
-from pydantic import Field
+from armcal_simulation.bench.world import WALL_AT_START, BenchTruthSettings, BenchWorld, FaultRequest, TrackedArm
+from pydantic import Field, ValidationError
 from typing_extensions import override
 
 from tests.simulated_lines.dtrack_sender import DTrackSender, DTrackSenderSettings
@@ -53,6 +51,8 @@ class LineTruthSettings(BenchTruthSettings):
 class LineFaultRequest(FaultRequest):
     """One fault, of the line too."""
 
+    kind: str  # type: ignore[assignment]
+    body: str | None = None  # type: ignore[assignment]
     after: Count = 0  # serial faults and ``nack``: how many messages or writes pass before it
     count: Annotated[int, Field(ge=1, le=1_000_000)] = 1  # serial faults: to how many messages or bytes it happens
     direction: Literal["to_host", "to_board"] = "to_board"  # serial faults
@@ -69,20 +69,19 @@ class LineWorld(BenchWorld):
     """
 
     split: Split  # gives messages on the line
-    kinds: ClassVar[tuple[str, ...]] = (*LINE_FAULTS, "unplug", "replug", *BenchWorld.kinds)
-    requests = LineFaultRequest
+    kinds: ClassVar[tuple[str, ...]] = (*LINE_FAULTS, "unplug", "replug", "lost", "silent", "frozen", "seen")
 
     def __init__(
         self,
         settings: LineTruthSettings,
         tracked: TrackedArm,
         servos: dict[str, JointServo],
-        bounds: Bounds,
+        file: ServoFile | None,
         folder: Path,
     ) -> None:
         self.stopped, self._folder, self._line = False, folder, None
         self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port)
-        super().__init__(settings, tracked, servos, bounds, appended_to(folder / LOG), tuple(settings.tracker.bodies))
+        super().__init__(settings, tracked, servos, file, folder / LOG, tuple(settings.tracker.bodies))
 
     def boot(self) -> None:
         """Start anew: power-up, or a reset."""
@@ -160,12 +159,30 @@ class LineWorld(BenchWorld):
                 raise ValueError(f"found advance {seconds!r}, expected seconds, at most {LONGEST_ADVANCE_S:.0f}")
             self.advance(seconds)
         elif "fault" in request:
-            self.faults.plan(request["fault"])
+            self._plan_checked(request["fault"])
         elif request.get("stop"):
             self.stopped = True
         elif not request.get("state"):
             raise ValueError("found none of advance, state, fault and stop")
         return self.state() if request.get("state") else {"now": self.now, "wall": WALL_AT_START + self.now}
+
+    def _plan_checked(self, content: Any) -> None:
+        try:
+            fault = LineFaultRequest.model_validate(content)
+        except ValidationError as refused:
+            raise ValueError(f"fault: {refused}") from refused
+        known = {"kind": self.kinds, "body": self._bodies}
+        for key, names in known.items():
+            if (name := getattr(fault, key)) is not None and name not in names:
+                raise ValueError(f"fault: found the {key} {name!r}, expected one of {', '.join(names)}.")
+        if fault.joint is not None and (unknown := unknown_joint([fault.joint], self.servos)):
+            raise ValueError(f"fault: {unknown}")
+        self.plan(fault)
+        self.run_faults()
+
+    def time(self) -> float:
+        """Seconds, as parts of the bench ask for them."""
+        return self.now
 
     @override
     def exposed(self, frame: TrackerFrame | None) -> None:

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 from armcal.base.settings import InputPath
 from armcal.devices.simulated import BenchRequest, RunningBench, SimulatedBench
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.safety import Commit
-from armcal_simulation.bench.servo_model import ServoModel
-from armcal_simulation.bench.truth import bounds_of, tracked_arm, true_servos
+from armcal_simulation.bench.servo_bench import true_servos
+from armcal_simulation.bench.servo_model import JointServo
+from armcal_simulation.bench.world import TrackedArm
 from pydantic import Field
 from typing_extensions import override
 
@@ -45,19 +45,19 @@ class PulseBench(LineWorld):
     kinds: ClassVar[tuple[str, ...]] = (*LineWorld.kinds, "reset", "brown_out", "nack", "stuck")
 
     def __init__(self, settings: ServoBenchSettings, experiment: Experiment, folder: Path) -> None:
-        tracked = tracked_arm(settings, experiment)
-        file = true_servos(settings, tracked.arm)
+        tracked = TrackedArm(settings, experiment)
+        file = true_servos(settings, tracked.arm.commanded)
         self._models = {
-            joint: ServoModel(settings.servo_of(joint), file.servos[joint].table, settings.start.get(joint, 0.0))
+            joint: JointServo(settings.servo_of(joint), settings.start.get(joint, 0.0), file.servos[joint].table)
             for joint in tracked.arm.commanded
         }
-        super().__init__(settings, tracked, self._models, bounds_of(experiment, file), folder)
+        super().__init__(settings, tracked, self._models, file, folder)
         self._eeprom = folder / _EEPROM
-        self._chips = {n: Pca9685Model(self.clock, b.oscillator_hz, b.address) for n, b in file.boards.items()}
+        self._chips = {n: Pca9685Model(self.time, b.oscillator_hz, b.address) for n, b in file.boards.items()}
         for name, chip in self._chips.items():
             chip.on_commit = partial(self._committed, name)
         self._joints = {(servo.board, servo.channel): joint for joint, servo in file.servos.items()}
-        self._bus = I2cBus(self.clock, list(self._chips.values()))
+        self._bus = I2cBus(self.time, list(self._chips.values()))
         identity = BoardIdentity(
             settings.board_id or next(iter(file.boards.values())).id, settings.states_oscillator_hz
         )
@@ -65,7 +65,7 @@ class PulseBench(LineWorld):
             boots = int(json.loads(self._eeprom.read_text(encoding="utf-8"))["boots"])
         except (OSError, ValueError, KeyError, TypeError):
             boots = 0
-        self._board = FramedBoard(self.clock, self._bus, self.send, identity, boots)
+        self._board = FramedBoard(self.time, self._bus, self.send, identity, boots)
         self.split = delimited(self._board.delimiter)
 
     @override
@@ -112,10 +112,10 @@ class PulseBench(LineWorld):
     def _committed(self, board: str, pin: PinCommit) -> None:
         joint = self._joints.get((board, pin.channel))
         if joint is not None:
-            commit = Commit(pin.time, pin.before, pin.after, self._chips[board].period_s / COUNTS)
-            self.safety.committed(joint, commit, self.physics.torques[joint])
+            step = self._chips[board].period_s / COUNTS
+            self.safety.committed(joint, pin.time, pin.before, pin.after, step, self.torques[joint])
             self._models[joint].command(pin.after)
-            self.physics.commands_changed()
+            self.commands_changed()
 
 
 class ServoBenchAtLine(SimulatedBench):

@@ -2,14 +2,14 @@
 
 import json
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from armcal.arm.clearance import ClearanceCheck
 from armcal.base.settings import Angle, Duration, Length, Settings
+from armcal.run.experiment import Experiment, clearance_check
 
 from armcal_simulation.bench.servo_model import JointServo, Positive
 
@@ -20,16 +20,6 @@ _AT_REST_S = 1.0
 _NO_TIME = -1e9
 _FOUND_RAD = 0.02
 """A first pulse that turns its joint by less takes it up where it stands: beyond a limit, that is nobody's offence."""
-
-
-@dataclass(frozen=True)
-class Commit:
-    """What reaches a servo changes at a time (s), from and to a pulse (s) or an angle (rad); None: it is let go."""
-
-    time: float
-    before: float | None
-    after: float | None
-    step: float = 0.0  # the smallest change that can be made
 
 
 class SafetySettings(Settings):
@@ -50,15 +40,6 @@ class SafetySettings(Settings):
     together: Duration = 0.1
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """What the experiment allows: joint limits (rad) and clearances, where it has them; pulses (s) that servos bear."""
-
-    limits: Mapping[str, tuple[float, float]]
-    clearance: ClearanceCheck | None
-    pulses: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-
-
 class Safety:
     """Keeps the log.
 
@@ -68,16 +49,29 @@ class Safety:
 
     Args:
         settings: what is unsafe.
+        experiment: has joint limits and clearances.
+        pulses: the range (s) of each joint whose servo takes pulses.
         servos: by joint.
-        log: a line of JSON for the first offence of each kind and joint, and for every event.
+        log: a file that takes a line of JSON for the first offence of each kind and joint, and for every event.
     """
 
     def __init__(
-        self, settings: SafetySettings, bounds: Bounds, servos: Mapping[str, JointServo], log: Callable[[str], None]
+        self,
+        settings: SafetySettings,
+        experiment: Experiment,
+        pulses: Mapping[str, tuple[float, float]],
+        servos: Mapping[str, JointServo],
+        log: Path,
     ) -> None:
         self.offences: Counter[str] = Counter()
         self.events: Counter[str] = Counter()
-        self._settings, self._bounds, self._servos, self._log = settings, bounds, servos, log
+        self._settings, self._servos, self._log, self._pulses = settings, servos, log, pulses
+        self._limits: Mapping[str, tuple[float, float]] = {}
+        self._clearance: ClearanceCheck | None = None
+        if (plan := experiment.settings.plan) is not None:
+            self._limits = plan.limits
+            if plan.clearance:
+                self._clearance = clearance_check(plan.clearance, experiment.system.arms, experiment.source)
         self._commanded: dict[str, float] = {}
         self._past: dict[str, deque[tuple[float, float]]] = {joint: deque() for joint in servos}
         self._first_pulse: tuple[float, str] = (_NO_TIME, "")
@@ -89,18 +83,24 @@ class Safety:
         self._inherited = 0.0
         self._poses: list[tuple[float, bool, list[float]]] = []
 
-    def committed(self, joint: str, commit: Commit, torque: float) -> None:
-        """A change at a joint's servo, while it carried a torque (N m)."""
-        servo, now, settings = self._servos[joint], commit.time, self._settings
-        if commit.after is None:
+    def committed(
+        self, joint: str, now: float, before: float | None, after: float | None, step: float, torque: float
+    ) -> None:
+        """What reaches a joint's servo changes, while it carries a torque (N m).
+
+        ``before`` and ``after`` are pulses (s) or angles (rad); None: it is let go. ``step`` is the smallest change
+        that can be made.
+        """
+        servo, settings = self._servos[joint], self._settings
+        if after is None:
             self._commanded.pop(joint, None)
             self._past[joint].clear()
             if abs(torque) > servo.settings.friction:
                 self._dropped[joint] = servo.angle
                 self._note("drop", joint, now, torque)
             return
-        angle = servo.angle_of(commit.after)
-        if commit.before is None:
+        angle = servo.angle_of(after)
+        if before is None:
             last, other = self._first_pulse
             if other != joint and now - last < settings.together * (1 - 1e-9):
                 self._offend("energised_together", joint, now, now - last, settings.together)
@@ -112,12 +112,12 @@ class Safety:
             self._weigh("first_pulse", abs(jump), joint=joint, value=jump)
             self._note("first_pulse", joint, now, jump)
         else:
-            self._judge_speed(joint, commit, angle)
+            self._judge_speed(joint, now, angle, abs(servo.angle_of(after + step) - angle))
         self._commanded[joint] = angle
         self._past[joint].append((now, angle))
         judged = (
-            ("limits", angle, self._bounds.limits, settings.limits_slack),
-            ("pulse", commit.after, self._bounds.pulses, settings.pulse_slack),
+            ("limits", angle, self._limits, settings.limits_slack),
+            ("pulse", after, self._pulses, settings.pulse_slack),
         )
         for kind, value, bounds, slack in judged:
             low, high = bounds.get(joint, (-np.inf, np.inf))
@@ -134,7 +134,7 @@ class Safety:
 
     def passed(self, now: float) -> None:
         """Time goes on from here: the arm is driven to what the pins command now."""
-        if not self._moved or self._bounds.clearance is None:
+        if not self._moved or self._clearance is None:
             if self._poses and now - self._poses[-1][0] > _AT_REST_S:
                 self.judge_clearance()
             return
@@ -146,7 +146,7 @@ class Safety:
                 self.judge_clearance()
 
     def judge_clearance(self) -> None:
-        check, poses = self._bounds.clearance, self._poses
+        check, poses = self._clearance, self._poses
         if check is None or not poses:
             return
         margins = check(np.array([angles for _, _, angles in poses]).T).margins.min(axis=0)
@@ -181,11 +181,10 @@ class Safety:
         if kind not in self._worst or amount > self._worst[kind][0]:
             self._worst[kind] = amount, entry
 
-    def _judge_speed(self, joint: str, commit: Commit, angle: float) -> None:
-        window, now, past = self._settings.window, commit.time, self._past[joint]
+    def _judge_speed(self, joint: str, now: float, angle: float, count: float) -> None:
+        window, past = self._settings.window, self._past[joint]
         while len(past) > 1 and past[1][0] <= now - window:
             past.popleft()
-        count = abs(self._servos[joint].angle_of((commit.after or 0.0) + commit.step) - angle)
         most = np.radians(self._settings.rate_deg_per_s)
         worst = 0.0
         for since, before in past:
@@ -200,21 +199,13 @@ class Safety:
         if (kind, joint) in self._logged:
             return
         self._logged.add((kind, joint))
-        self._log(_line(time=now, offence=kind, joint=joint or None, value=value, limit=limit))
+        self._write(time=now, offence=kind, joint=joint or None, value=value, limit=limit)
 
     def _note(self, kind: str, joint: str, now: float, value: float) -> None:
         self.events[kind] += 1
-        self._log(_line(time=now, event=kind, joint=joint, value=value))
+        self._write(time=now, event=kind, joint=joint, value=value)
 
-
-def appended_to(path: Path) -> Callable[[str], None]:
-    def log(line: str) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-
-    return log
-
-
-def _line(**content: object) -> str:
-    return json.dumps({key: value for key, value in content.items() if value is not None})
+    def _write(self, **content: object) -> None:
+        self._log.parent.mkdir(parents=True, exist_ok=True)
+        with self._log.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({key: value for key, value in content.items() if value is not None}) + "\n")

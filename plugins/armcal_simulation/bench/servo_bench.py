@@ -1,73 +1,218 @@
 """The simulated bench ``servo_bench``: a board, an arm of servos and a tracker in this process."""
 
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
+import numpy as np
+from armcal.arm.assembly import Arm
+from armcal.arm.joints import unknown_joint
+from armcal.arm.servo import SPLINE_TEETH, PulseClock, PulseTable
+from armcal.calibration.calibration_file import identity_of
+from armcal.config.servo_file import ServoFile, digest, load_servo_file
 from armcal.devices.clock import Clock
-from armcal.devices.device import JointDevice, MeasuringDevice
-from armcal.devices.live import JointStream, Tracker, TrackerFrame
+from armcal.devices.device import (
+    DeviceError,
+    DeviceIdentity,
+    DeviceLostError,
+    DeviceRefusedError,
+    DeviceResetError,
+    DeviceState,
+    DeviceUnwellError,
+    JointDevice,
+    MeasuringDevice,
+    PulseDevice,
+)
+from armcal.devices.live import JointSample, JointStream, Tracker, TrackerFrame
 from armcal.devices.simulated import ACCOUNT, LOG, BenchRequest, RunningBench, SimulatedBench
-from armcal.errors import InputError, Location
+from armcal.devices.wiring import servo_file_of
+from armcal.errors import ConfigError, InputError, Location
 from armcal.io.plain_files import write_whole
 from typing_extensions import override
 
-from armcal_simulation.bench.devices import (
-    SimulatedDevice,
-    SimulatedJoints,
-    SimulatedMeasuringDevice,
-    SimulatedPulseDevice,
-)
-from armcal_simulation.bench.safety import appended_to
+from armcal_simulation.bench.servo_model import JointServo
 from armcal_simulation.bench.tracker import SimulatedTracker
-from armcal_simulation.bench.truth import BenchTruthSettings
-from armcal_simulation.bench.world import WALL_AT_START, ServoWorld
+from armcal_simulation.bench.world import ALL, WALL_AT_START, BenchTruthSettings, BenchWorld, FaultRequest, TrackedArm
 
 EXAMPLE_SERVOS = Path(__file__).with_name("example_servos.yaml")
+TICK_S = 0.02  # of the board's watchdog
+ADAPTER = "simulated"
+_TOOTH = 2 * math.pi / SPLINE_TEETH
+_BURNING, _HOT = 0.95, 0.9  # of a winding's limit; a servo that knows its temperature reports the second
+_STREAM_S = 0.02
 _FALLEN_IN_S = 5.0
 _KEPT_EVERY_S = 10.0
 
 
-class WorldClock(Clock):
-    """Time of a simulated world: it passes there, and only there, while this one sleeps."""
+@dataclass(frozen=True)
+class Wire:
+    """Where a device's joint leads: to the servo of a joint (none: to nothing), which takes angles (rad).
 
-    def __init__(self, world: ServoWorld, keep: Callable[[float], None]) -> None:
-        self._world, self._keep, self._kept = world, keep, world.now
+    At the commanded angle zero that joint stands at ``off``, and turns in a ``direction``.
+    """
+
+    joint: str | None
+    direction: Literal[1, -1] = 1
+    off: float = 0.0
+
+    @property
+    def step(self) -> float:
+        """The smallest change of what reaches the servo: here a count of usual encoders."""
+        return 2 * math.pi / 4096
+
+    def position(self, angle: float) -> float:
+        """What is written to the servo for a commanded angle (rad)."""
+        return angle
+
+    def rate(self, rate: float) -> float:
+        """The rate of positions (per s) at which no angle goes faster than this (rad/s)."""
+        return rate
+
+    def angle(self, position: float) -> float:
+        """The commanded angle (rad) of what is written."""
+        return position
+
+    def arriving(self, position: float) -> float:
+        """What reaches the servo."""
+        return self.direction * position + self.off
+
+    def read(self, shaft: float) -> float:
+        """The angle (rad) that the device reads where the servo's shaft stands."""
+        return self.direction * (shaft - self.off)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PulseWire(Wire):
+    """One to a servo that takes pulses (s): whole counts of a clock that runs other than is stated."""
+
+    stated: PulseTable
+    clock: PulseClock
+    true_clock: PulseClock
+
+    @property
+    @override
+    def step(self) -> float:
+        return self.true_clock.tick
 
     @override
-    def now(self) -> float:
-        return self._world.now
+    def position(self, angle: float) -> float:
+        return float(self.clock.counts(self.stated.pulse(angle)))
 
     @override
-    def wall(self) -> float:
-        return WALL_AT_START + self._world.now
+    def rate(self, rate: float) -> float:
+        return rate * (self.stated.least_slope / self.clock.tick)
 
     @override
-    def sleep(self, seconds: float) -> None:
-        if seconds > 0:
-            self._world.advance(seconds)
-        if self._world.now - self._kept >= _KEPT_EVERY_S:
-            self._kept = self._world.now
-            self._keep(_KEPT_EVERY_S)
+    def angle(self, position: float) -> float:
+        return float(self.stated.angle(round(position) * self.clock.tick))
+
+    @override
+    def arriving(self, position: float) -> float:
+        return round(position) * self.true_clock.tick
 
 
-class RunningServoBench(RunningBench):
-    """A world, and what a session opens in it. Its state is kept in the folder, and gone on from when it is there."""
+def true_servos(settings: BenchTruthSettings, joints: Collection[str], stated: Path | None = None) -> ServoFile | None:
+    """Boards and servos as they are, by the settings' servo file or the device's; None where there is neither.
+
+    Raises:
+        ConfigError: the file is refused, or names other joints than the arm has.
+    """
+    if fault := unknown_joint([name for name in (*settings.joints, *settings.start) if name != ALL], joints):
+        raise ConfigError(f"bench.simulator: {fault}.")
+    if fault := unknown_joint([fault.joint for fault in settings.faults if fault.joint is not None], joints):
+        raise ConfigError(f"bench.simulator.faults: {fault}.")
+    if (path := settings.servos or stated) is None:
+        return None
+    file = load_servo_file(path)
+    if missing := sorted(set(joints) - set(file.servos)):
+        hint = "The bench needs the true pulse table of every joint."
+        raise ConfigError(f"found no servo for {', '.join(missing)}.", where=Location(str(path)), hint=hint)
+    if fault := unknown_joint(file.servos, joints):
+        raise ConfigError(f"{fault}.", where=Location(str(path)))
+    return file
+
+
+def _wires(settings: BenchTruthSettings, arm: Arm, stated: ServoFile | None, true: ServoFile | None) -> dict[str, Wire]:
+    """By the device's names of joints. With exchanged plugs they lead to each other's servos."""
+    wires: dict[str, Wire] = {}
+    if stated is None or true is None:
+        for joint in arm.commanded:
+            servo = settings.servo_of(joint)
+            wires[joint] = Wire(joint, -1 if servo.reversed else 1, servo.zero_off + servo.horn_teeth * _TOOTH)
+        return wires
+    places = {(true.boards[s.board].address, s.channel): joint for joint, s in true.servos.items()}
+    for joint in arm.commanded:
+        if (configured := stated.servos.get(joint)) is None:
+            continue
+        board = stated.boards[configured.board]
+        led_to = places.get((board.address, configured.channel))
+        named = true.servos[led_to if led_to is not None else joint]
+        clock = PulseClock(true.boards[named.board].oscillator_hz, board.prescale)
+        wires[joint] = PulseWire(led_to, stated=configured.table, clock=board.clock, true_clock=clock)
+    return wires
+
+
+class RunningServoBench(BenchWorld, RunningBench):
+    """The bench in this process: a board as its firmware has it, before servos, arm and tracker.
+
+    The board's watchdog drives the arm when its host falls silent. The state is kept in the folder, and gone on from
+    when it is there.
+
+    Attributes:
+        wires: by the device's joints, to which servos they lead.
+        positions: by the device's joints, what is written to those that are driven (counts, or rad); others hang free.
+        boots: how often the board has started.
+        is_there: it can be reached; unplugged it goes on by its own power.
+        took_over: it has begun to drive, and no host has taken over again.
+        calibrated: a fingerprint of what a calibration of the device hangs on.
+
+    Raises:
+        ConfigError: the settings do not fit the experiment.
+        InputError: what is kept in the folder is no bench's.
+    """
 
     def __init__(self, settings: BenchTruthSettings, request: BenchRequest) -> None:
-        self._account, self._latency = request.folder / ACCOUNT, settings.tracker.latency
-        self._world = ServoWorld(settings, request.experiment, appended_to(request.folder / LOG), self._before())
+        source = request.experiment.source
+        tracked = TrackedArm(settings, request.experiment)
+        path = servo_file_of(source)
+        stated = None if path is None else load_servo_file(path)
+        true = true_servos(settings, tracked.arm.commanded, path)
+        true = None if stated is None else true
+        self.wires = _wires(settings, tracked.arm, stated, true)
+        self.calibrated = identity_of({"device": str(source.data.get("bench", {}).get("device"))})
+        if stated is not None:
+            self.calibrated = digest({joint: stated.calibrated(joint) for joint in self.wires})
+        self._account = request.folder / ACCOUNT
+        before = self._before()
+        servos: dict[str, JointServo] = {}
+        for joint in tracked.arm.commanded:
+            angle = before["joints"][joint]["shaft_rad"] if before else settings.start.get(joint, 0.0)
+            table = None if true is None else true.servos[joint].table
+            servos[joint] = JointServo(settings.servo_of(joint), angle, table)
+        self.positions: dict[str, float] = dict(before["board"]["positions"]) if before else {}
+        self.boots, self.is_there = before["board"]["boots"] if before else 1, True
+        for name, position in self.positions.items():  # those that held hold on
+            wire = self.wires[name]
+            if wire.joint is not None:
+                servos[wire.joint].command(wire.arriving(position))
+        super().__init__(settings, tracked, servos, true, request.folder / LOG, now=before.get("now", 0.0))
+        self._forget()
+        self._encoders = np.random.default_rng([settings.seed, 2, int(self.now)])
         self._tracker = SimulatedTracker({"tool": request.tool, "base": request.base})
-        self._world.frames = self._send
-        self.clock: Clock = WorldClock(self._world, self._keep)
+        if before:
+            self.go_on(before)
+        self.plan(*(fault for fault in settings.faults if fault.at >= self.now))
+        self.clock: Clock = WorldClock(self, self._keep)
 
     @override
     def device(self, configured: JointDevice, is_guarded: bool) -> JointDevice:
         if isinstance(configured, MeasuringDevice):
-            return SimulatedMeasuringDevice(configured, self._world, is_guarded)
+            return SimulatedMeasuringDevice(configured, self, is_guarded)
         made = SimulatedPulseDevice if hasattr(configured, "set_pulse") else SimulatedDevice
-        return made(configured, self._world, is_guarded)
+        return made(configured, self, is_guarded)
 
     @override
     def tracker(self, configured: Tracker) -> Tracker:
@@ -75,15 +220,113 @@ class RunningServoBench(RunningBench):
 
     @override
     def joints(self, configured: JointStream) -> JointStream:
-        return SimulatedJoints(self._world)
+        return SimulatedJoints(self)
 
     @override
     def close(self) -> None:
-        self._world.advance(_FALLEN_IN_S)
+        self.advance(_FALLEN_IN_S)
         self._keep(0.0)
 
-    def _send(self, frame: TrackerFrame) -> None:
-        self._tracker.send(frame, self._world.now + self._latency)
+    def write(self, name: str, position: float | None) -> None:
+        """Set what a device's joint gets, in positions; None: nothing more."""
+        before, wire = self.positions.pop(name, None), self.wires[name]
+        if position is not None:
+            self.positions[name] = position
+        if wire.joint is None:  # nothing is plugged in there
+            return
+        old, new = (None if place is None else wire.arriving(place) for place in (before, position))
+        if old != new:
+            self.safety.committed(wire.joint, self.now, old, new, wire.step, self.torques[wire.joint])
+            self.servos[wire.joint].command(new)
+            self.commands_changed()
+
+    def heard(self) -> None:
+        """The host lives."""
+        self._heard = self.now
+
+    def guard(self, waypoints: Sequence[Mapping[str, float]], rates: Mapping[str, float], after_s: float) -> None:
+        """Replace the guard set before: to which positions after a silence, each joint no faster than its rate."""
+        self._waypoints, self._rates, self._after_s = tuple(waypoints), dict(rates), after_s
+
+    def take(self) -> None:
+        """A host takes over again: the drive stops where it stands."""
+        self.took_over, self._next_tick = False, math.inf
+        self.heard()
+
+    def encoder_angle(self, joint: str) -> float:
+        """The angle (rad) that the device reads of a joint's encoder."""
+        wire = self.wires[joint]
+        servo = self.servos[joint if wire.joint is None else wire.joint]
+        return wire.read(servo.shaft + servo.settings.encoder_noise * float(self._encoders.standard_normal()))
+
+    @override
+    def exposed(self, frame: TrackerFrame | None) -> None:
+        if frame is not None:
+            self._tracker.send(frame, self.now + self.settings.tracker.latency)
+
+    @override
+    def next_event(self) -> float:
+        if self.took_over or not self._waypoints:
+            return self._next_tick
+        return self._heard + self._after_s
+
+    @override
+    def run_timers(self) -> None:
+        if not self.took_over and self._waypoints and self.now >= self.next_event():
+            self.took_over, self._drive, self._next_tick = True, self._driven(), self.now
+        if self.took_over and self.now >= self._next_tick:
+            is_there = next(self._drive, True)
+            self._next_tick = math.inf if is_there else self.now + TICK_S
+
+    @override
+    def state(self) -> dict[str, Any]:
+        board = {"boots": self.boots, "took_over": self.took_over, "positions": dict(self.positions)}
+        return {**super().state(), "board": board}
+
+    @override
+    def fail(self, fault: FaultRequest) -> None:
+        if fault.kind in ("unplug", "replug"):
+            self.is_there = fault.kind == "replug"
+        elif fault.kind in ("reset", "brown_out") and fault.joint is None:
+            self.boots += 1
+            self._forget()
+            for name in [*self.positions] if fault.kind == "brown_out" else ():
+                self.write(name, None)
+        for joint, servo in self.servos.items():
+            if fault.joint not in (None, joint):
+                continue
+            if fault.kind == "brown_out" and fault.joint:
+                self.boots += 1  # its host finds out
+                self.write(next(name for name, wire in self.wires.items() if wire.joint == joint), None)
+            elif fault.kind == "jam":
+                servo.stops = (servo.shaft, servo.shaft)
+            elif fault.kind == "free":
+                servo.stops = servo.settings.travel
+            elif fault.kind == "put":
+                servo.put(fault.angle)
+            elif fault.kind == "heat":
+                self.heat[joint].winding = _BURNING
+        self.commands_changed()
+        super().fail(fault)
+
+    def _forget(self) -> None:
+        """The board starts anew."""
+        self.guard((), {}, 0.0)
+        self.take()
+
+    def _driven(self) -> Iterator[bool]:
+        """Through the waypoints, a step at each tick."""
+        for waypoint in self._waypoints:
+            # joints that hang free stay so: nobody knows where their servos stand
+            start = {name: self.positions[name] for name in waypoint if name in self.positions}
+            far = (abs(waypoint[name] - position) / self._rates[name] for name, position in start.items())
+            begin, seconds, is_there = self.now, max(far, default=0.0), False
+            while not is_there:
+                share = 1.0 if seconds <= 0 else min(1.0, (self.now - begin) / seconds)
+                for name, position in start.items():
+                    self.write(name, position + share * (waypoint[name] - position))
+                is_there = self.now >= begin + seconds
+                yield False
 
     def _before(self) -> dict[str, Any]:
         """The state that is there; empty if none is.
@@ -104,9 +347,208 @@ class RunningServoBench(RunningBench):
 
     def _keep(self, passed_s: float) -> None:
         """Write the state down; whoever goes on from there does so after some seconds more."""
-        state = self._world.state()
+        state = self.state()
         self._account.parent.mkdir(parents=True, exist_ok=True)
         write_whole(self._account, (json.dumps({**state, "now": state["now"] + passed_s}) + "\n").encode())
+
+
+class WorldClock(Clock):
+    """Time of a simulated bench: it passes there, and only there, while this one sleeps."""
+
+    def __init__(self, bench: RunningServoBench, keep: Callable[[float], None]) -> None:
+        self._bench, self._keep, self._kept = bench, keep, bench.now
+
+    @override
+    def now(self) -> float:
+        return self._bench.now
+
+    @override
+    def wall(self) -> float:
+        return WALL_AT_START + self._bench.now
+
+    @override
+    def sleep(self, seconds: float) -> None:
+        if seconds > 0:
+            self._bench.advance(seconds)
+        if self._bench.now - self._kept >= _KEPT_EVERY_S:
+            self._kept = self._bench.now
+            self._keep(_KEPT_EVERY_S)
+
+
+class SimulatedDevice(JointDevice):
+    """The same joints and angles as the configured device's, on the simulated board.
+
+    Args:
+        configured: names the joints, and knows which angles can be set. It is never opened.
+        bench: has the board.
+        is_guarded: whether the configured board looks after the arm when its host falls silent.
+    """
+
+    def __init__(self, configured: JointDevice, bench: RunningServoBench, is_guarded: bool) -> None:
+        self._configured, self._bench, self._is_guarded = configured, bench, is_guarded
+        self._boots: int | None = None
+        self._took_over = False
+
+    @property
+    @override
+    def joint_names(self) -> tuple[str, ...]:
+        return self._configured.joint_names
+
+    @override
+    def open(self, clock: Clock) -> DeviceIdentity:
+        if not self._bench.is_there:
+            raise DeviceLostError("the simulated board is unplugged.", hint="The fault replug plugs it in again.")
+        self._boots, self._took_over = self._bench.boots, self._bench.took_over
+        self._bench.take()
+        digest = identity_of({"device": self._bench.calibrated, "joints": list(self.joint_names)})
+        return DeviceIdentity("a simulated board", digest, self._boots, ADAPTER)
+
+    @override
+    def state(self) -> DeviceState:
+        self._reach()
+        positions, wires = self._bench.positions, self._bench.wires
+        angles = {joint: wires[joint].angle(positions[joint]) for joint in self.joint_names if joint in positions}
+        return DeviceState(angles, self._took_over)
+
+    @override
+    def standing(self, angles: Mapping[str, float]) -> dict[str, float]:
+        return self._configured.standing(angles)
+
+    @override
+    def energise(self, joint: str, angle: float) -> None:
+        self._write({joint: self._position(joint, angle)})
+
+    @override
+    def command(self, angles: Mapping[str, float]) -> None:
+        self._reach()
+        if limp := [joint for joint in angles if joint not in self._bench.positions]:
+            text = f"found commands for {', '.join(limp)}, which hang free."
+            raise DeviceRefusedError(text, hint="Energise them first, one at a time.")
+        self._write({joint: self._position(joint, angle) for joint, angle in angles.items()})
+
+    @override
+    def keep_alive(self) -> None:
+        self._reach()
+
+    @override
+    def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
+        self._reach()
+        if self._is_guarded:
+            named = {joint for waypoint in waypoints for joint in waypoint}
+            ways = [{joint: self._position(joint, angle) for joint, angle in way.items()} for way in waypoints]
+            rates = {joint: self._bench.wires[joint].rate(rate) for joint in named}
+            self._bench.guard(ways, rates, after_s)
+        return self._is_guarded
+
+    @override
+    def release(self, joint: str) -> None:
+        self._reach()
+        self._bench.write(joint, None)
+
+    @override
+    def close(self) -> None:
+        self._boots = None
+
+    def _position(self, joint: str, angle: float) -> float:
+        return self._bench.wires[joint].position(self.standing({joint: angle})[joint])
+
+    def _write(self, positions: Mapping[str, float]) -> None:
+        self._reach()
+        for joint, position in positions.items():
+            self._bench.write(joint, position)
+
+    def _reach(self) -> None:
+        """The board hears of its host.
+
+        Raises:
+            DeviceError: it does not, or has started anew or taken over since it was opened.
+        """
+        board = self._bench
+        fault: DeviceError | None = None
+        if self._boots is None or not board.is_there:
+            fault = DeviceLostError("the simulated board is gone.", hint="Open it again.")
+        elif board.boots != self._boots:
+            fault = DeviceResetError("the simulated board has started anew.", hint="Look at its power.")
+        elif board.took_over:
+            text = "the simulated board has heard nothing for too long and drives the arm by itself."
+            fault = DeviceLostError(text, hint="Open it again, and read where the arm is.")
+        if fault is not None:
+            self._boots = None
+            raise fault
+        board.heard()
+
+
+class SimulatedPulseDevice(SimulatedDevice, PulseDevice):
+    """One whose servos take pulses."""
+
+    @override
+    def set_pulse(self, joint: str, pulse: float) -> float:
+        wire = self._bench.wires[joint]
+        if not isinstance(wire, PulseWire):
+            raise DeviceError("this joint's servo takes no pulses.", hint="Name a servo file in bench.device.servos.")
+        counts = float(wire.clock.counts(pulse))
+        self._write({joint: counts})
+        return counts * wire.clock.tick
+
+
+class SimulatedMeasuringDevice(SimulatedDevice, MeasuringDevice):
+    """One whose servos know where they stand, and how hot they are."""
+
+    def __init__(self, configured: JointDevice, bench: RunningServoBench, is_guarded: bool) -> None:
+        super().__init__(configured, bench, is_guarded)
+        self._reported: set[str] = set()
+
+    @override
+    def measured(self) -> dict[str, float]:
+        self._reach()
+        return {joint: self._bench.encoder_angle(joint) for joint in self.joint_names}
+
+    @override
+    def keep_alive(self) -> None:
+        super().keep_alive()
+        for joint, heat in self._bench.heat.items():
+            if heat.winding >= _HOT and joint not in self._reported:
+                self._reported.add(joint)
+                raise DeviceUnwellError(f"the servo of {joint} is too hot.", hint="Let it cool, with torque off.")
+
+
+class SimulatedJoints(JointStream):
+    """Joint readings of a simulated arm that is guided by hand: by the faults ``put`` of its bench."""
+
+    def __init__(self, bench: RunningServoBench) -> None:
+        self._bench = bench
+        self._channels: dict[str, str] = {}
+        self._clock: Clock | None = None
+        self._next = 0.0
+
+    @override
+    def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
+        self._channels = {channel: channel.rpartition(".")[2] for channel in channels}
+        if unknown := sorted(set(self._channels.values()) - self._bench.wires.keys()):
+            raise ConfigError(f"the simulated arm has no joint {unknown[0]!r}.", hint="Record a single arm.")
+        self._clock, self._next = clock, clock.now()
+
+    @override
+    def samples(self) -> list[JointSample]:
+        if self._clock is None or (now := self._clock.now()) < self._next:
+            return []
+        self._next = now + _STREAM_S
+        angles = {channel: self._bench.encoder_angle(joint) for channel, joint in self._channels.items()}
+        return [JointSample(now, None, angles)]
+
+    @property
+    @override
+    def ended(self) -> bool:
+        return self._clock is None
+
+    @property
+    @override
+    def refused(self) -> Mapping[str, int]:
+        return {}
+
+    @override
+    def close(self) -> None:
+        self._clock = None
 
 
 class ServoBench(SimulatedBench):

@@ -11,7 +11,6 @@ from typing import Annotated, Self
 from armcal.arm.servo import PulseTable
 from armcal.base.settings import Angle, Duration, Settings, Torque
 from pydantic import Field, model_validator
-from typing_extensions import override
 
 Positive = Annotated[float, Field(gt=0)]
 _NEAR = 1e-12
@@ -29,6 +28,9 @@ class ServoJointSettings(Settings):
     the time constants of each node against what it gives its heat to. Under its load the horn slips on the gear by
     ``creep_deg_per_min`` for each N m, as with a loose screw. Its load turns it by ``compliance_deg_per_Nm`` while it
     holds. An encoder on the gear, where the device reads one, sees that, and has ``encoder_noise``.
+
+    Of servos without a pulse table a device does not know that at the commanded angle zero the joint stands at
+    ``zero_off``, and ``horn_teeth`` further; one that is ``reversed`` turns it the other way.
     """
 
     speed_deg_per_s: Positive = 300.0
@@ -45,6 +47,9 @@ class ServoJointSettings(Settings):
     winding_share: Annotated[float, Field(gt=0, lt=1)] = 0.3
     compliance_deg_per_Nm: Annotated[float, Field(ge=0)] = 0.0
     encoder_noise: Annotated[Angle, Field(ge=0)] = 4.6e-4
+    zero_off: Angle = 0.0
+    horn_teeth: int = 0
+    reversed: bool = False
 
     @model_validator(mode="after")
     def _physical(self) -> Self:
@@ -63,7 +68,7 @@ class JointServo:
 
     Attributes:
         settings: what kind of servo it is.
-        angle: of its horn (rad).
+        angle: of its horn (rad); ``shaft``: at the encoder, of the gear, ahead of its backlash.
         target: where it is sent (rad), within its stops; None while it is not powered.
         approach: the sign of its last motion; 0 before the first.
         stops: where it can turn no further (rad).
@@ -71,30 +76,34 @@ class JointServo:
 
     Args:
         angle: where it stands.
+        table: the angle that it takes at each pulse length, in truth; None: it takes angles.
     """
 
-    def __init__(self, settings: ServoJointSettings, angle: float) -> None:
+    def __init__(self, settings: ServoJointSettings, angle: float, table: PulseTable | None = None) -> None:
         self.settings, self.angle, self.approach, self.failed = settings, angle, 0, False
         self.target: float | None = None
         self.stops = settings.travel
         self._horn, self._slipped, self._creep = angle, 0.0, math.radians(settings.creep_deg_per_min) / 60.0
-        self._gear = angle  # where the gear stands, without its backlash (rad)
+        self.shaft = angle
         self._driving = False
         self._compliance = math.radians(settings.compliance_deg_per_Nm)
         self._speed, self._fall_speed = math.radians(settings.speed_deg_per_s), math.radians(settings.fall_deg_per_s)
+        self._pulses: tuple[float, ...] = ()
+        if table is not None:
+            order = slice(None, None, 1 if table.pulses[0] < table.pulses[-1] else -1)
+            self._pulses, self._angles = table.pulses[order], table.angles[order]
 
     @property
     def powered(self) -> bool:
         return self.target is not None and not self.failed
 
-    @property
-    def shaft(self) -> float:
-        """The angle (rad) at the encoder: of the gear, ahead of its backlash."""
-        return self._gear
-
     def angle_of(self, command: float) -> float:
-        """The angle (rad) that a command asks for, as it reaches the servo: here an angle itself."""
-        return command
+        """The angle (rad) that a command asks for: itself, or of a pulse (s), linear between knots and beyond them."""
+        if not self._pulses:
+            return command
+        at = min(max(bisect_right(self._pulses, command), 1), len(self._pulses) - 1)
+        p0, p1, a0, a1 = self._pulses[at - 1], self._pulses[at], self._angles[at - 1], self._angles[at]
+        return a0 + (command - p0) * (a1 - a0) / (p1 - p0)
 
     def command(self, command: float | None) -> None:
         """Drive to what a command asks for; None: let go."""
@@ -106,15 +115,15 @@ class JointServo:
     def put(self, angle: float) -> None:
         """Somebody turns it by hand (rad), where it does not hold."""
         if not self.powered:
-            self._gear = self._horn = self.angle = angle
+            self.shaft = self._horn = self.angle = angle
 
     def rests(self, torque: float) -> bool:
         """Whether it stays where it is under a torque (N m), as it is driven now."""
         if self.holds(torque):
-            error = abs(self._aim(torque) - self._gear)
+            error = abs(self._aim(torque) - self.shaft)
             return error <= _NEAR or not (self._driving or error > self.settings.dead_band)
         low, high = self.stops
-        at_stop = self._gear >= high - _NEAR if torque > 0 else self._gear <= low + _NEAR
+        at_stop = self.shaft >= high - _NEAR if torque > 0 else self.shaft <= low + _NEAR
         return at_stop or abs(torque) <= self.settings.friction
 
     def gives_way(self, torque: float) -> bool:
@@ -129,21 +138,21 @@ class JointServo:
             self.angle = self._horn + self._slipped
         if self.rests(torque):
             return slips
-        before = self._gear
+        before = self.shaft
         if self.holds(torque):
             error, step = self._aim(torque) - before, self._speed * seconds
             self._driving = abs(error) > step
-            self._gear += math.copysign(step, error) if self._driving else error
+            self.shaft += math.copysign(step, error) if self._driving else error
         else:
             step = self._fall_speed * seconds
             low, high = self.stops
-            self._gear = min(max(before + (step if torque > 0 else -step), low), high)
-        moved = self._gear - before
+            self.shaft = min(max(before + (step if torque > 0 else -step), low), high)
+        moved = self.shaft - before
         if moved and not (self._compliance and self.powered):  # what its load turns it by is no motion of its own
             self.approach = 1 if moved > 0 else -1
         # the gear pushes the horn at one end of the gap
         half = self.settings.backlash / 2
-        self._horn = min(max(self._horn, self._gear - half), self._gear + half)
+        self._horn = min(max(self._horn, self.shaft - half), self.shaft + half)
         self.angle = self._horn + self._slipped
         return bool(moved) or slips
 
@@ -155,23 +164,6 @@ class JointServo:
         """Where the gear is drawn to: the target, less what the load makes it stand off."""
         low, high = self.stops
         return min(max((self.target or 0.0) + self._compliance * torque, low), high)
-
-
-class ServoModel(JointServo):
-    """A hobby servo, which takes pulses. ``table``: the angle that it takes at each pulse length, in truth."""
-
-    def __init__(self, settings: ServoJointSettings, table: PulseTable, angle: float) -> None:
-        super().__init__(settings, angle)
-        rising = table.pulses[0] < table.pulses[-1]
-        order = slice(None) if rising else slice(None, None, -1)
-        self._pulses, self._angles = table.pulses[order], table.angles[order]
-
-    @override
-    def angle_of(self, command: float) -> float:
-        """The angle (rad) that a pulse (s) commands; linear between the table's knots and beyond them."""
-        at = min(max(bisect_right(self._pulses, command), 1), len(self._pulses) - 1)
-        p0, p1, a0, a1 = self._pulses[at - 1], self._pulses[at], self._angles[at - 1], self._angles[at]
-        return a0 + (command - p0) * (a1 - a0) / (p1 - p0)
 
 
 class ServoHeat:

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -38,24 +38,19 @@ class TrackerSettings(Settings):
     mirrored: Literal["none", "x", "y", "z"] = "none"
 
 
-@dataclass
-class TrackerFaults:
-    """What is wrong with the tracker now; to be changed at any time.
+class TrackerModel:
+    """Sees bodies, in an order that its random numbers go by. The same seed, times and poses give the same frames.
 
     Attributes:
+        hidden: bodies that it cannot see now.
+        silent: it sends nothing, while its frame counter goes on.
         frozen: it sends the last frame again and again, with a ``rising`` counter or the ``same``.
     """
 
-    hidden: set[str] = field(default_factory=set)  # bodies that it cannot see
-    silent: bool = False  # it sends nothing, while its frame counter goes on
-    frozen: Literal["no", "rising", "same"] = "no"
-
-
-class TrackerModel:
-    """Sees bodies, in an order that its random numbers go by. The same seed, times and poses give the same frames."""
-
     def __init__(self, settings: TrackerSettings, bodies: Sequence[str], random: np.random.Generator) -> None:
-        self.faults, self.counter = TrackerFaults(), 1
+        self.hidden: set[str] = set()
+        self.silent, self.counter = False, 1
+        self.frozen: Literal["no", "rising", "same"] = "no"
         self._settings, self._bodies, self._random = settings, tuple(bodies), random
         self._last: float | None = None
         self._occluded: set[str] = set()
@@ -72,13 +67,13 @@ class TrackerModel:
         self._last = now
         poses = self._seen(bodies, elapsed)
         is_lost = self._random.random() < self._settings.lost_frames
-        if self.faults.frozen == "no" or self._shown is None:
+        if self.frozen == "no" or self._shown is None:
             self._shown = TrackerFrame(self.counter, now, None, poses)
         shown = self._shown
-        if self.faults.frozen == "rising":
+        if self.frozen == "rising":
             shown = replace(shown, counter=self.counter, arrived=now)
         self.counter += 1
-        return None if is_lost or self.faults.silent else shown
+        return None if is_lost or self.silent else shown
 
     def _seen(self, bodies: Mapping[str, Array | None], elapsed: float) -> dict[str, Array | None]:
         """Bodies with noise; as many random numbers are drawn whether they are seen or not."""
@@ -96,7 +91,7 @@ class TrackerModel:
             elif chances[row] < end * fraction / (1 - fraction):
                 self._occluded.add(name)
             pose = bodies.get(name)
-            is_hidden = name in self._occluded or name in self.faults.hidden
+            is_hidden = name in self._occluded or name in self.hidden
             poses[name] = None if is_hidden or pose is None else self._noisy(pose, noise[row])
         return poses
 
