@@ -18,8 +18,8 @@ from armcal.devices.wiring import WiringRecord
 from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
 from armcal_servobus.bus import LAST_ID, Bus, BusSettings, FoundServo, looked_at, present
-from armcal_servobus.device import SEVERAL_TURNS, ServoBusSettings, ServoStreamSettings, examined
-from armcal_servobus.joints import ServoJoint, ServoJointsSettings, Servos, bus_of, check_offset
+from armcal_servobus.device import ServoBusSettings, ServoStreamSettings
+from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos, check_offset
 from armcal_servobus.models import BAUD_RATES, COUNTS, STEP, ProtocolName
 
 _SECTION = "bench"
@@ -106,19 +106,9 @@ def _on_config(command: Any) -> Any:
     return click.argument("config", type=FILE)(overrides(speaking(command)))
 
 
-@dataclass(frozen=True)
-class _Opened:
-    """The bus of a configuration."""
-
-    bus: Bus
-    joints: dict[str, ServoJoint]
-    checks: WiringRecord
-    adapter: str
-
-
 @contextmanager
-def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[_Opened]:
-    """Of the bench's device, or of its joint stream.
+def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Servos, WiringRecord]]:
+    """The servos of the bench's device, or of its joint stream, and the record of which were checked.
 
     Raises:
         ConfigError: neither is a servo bus, or its settings are refused.
@@ -133,13 +123,12 @@ def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[_Opened]:
     stripped = {key: value for key, value in parts[part].items() if key != "type"}
     data = {**source.data, _SECTION: {**parts, part: stripped}}
     settings = validate(_KINDS[part], replace(source, data=data), (_SECTION, part))
-    joints = settings.chosen(settings.joints)
-    wires = bus_of(settings, joints)
-    adapter = wires.open()
+    servos = Servos(settings, settings.joints)
+    servos.bus.open()
     try:
-        yield _Opened(wires, joints, WiringRecord.of_config(source, joints), adapter)
+        yield servos, WiringRecord.of_config(source, servos.joints)
     finally:
-        wires.close()
+        servos.bus.close()
 
 
 @bus.command()
@@ -149,19 +138,21 @@ def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
 
     Ids, models, homing offsets, limits, modes, voltages, alarms. Nothing is written to them.
     """
-    with _opened(config, overrides) as at:
-        stored, mistakes = examined(at.bus, at.joints)
-        there = {name: at.joints[name] for name in stored}
-        readings = Servos(at.bus, there).readings()
+    with _opened(config, overrides) as (servos, _):
+        mistakes, joints, stored = servos.examine(), servos.joints, servos.stored
+        servos.joints = {name: joints[name] for name in stored}
+        readings = servos.readings()
+        alarms = {name: list(servos.bus.alarms(joint.id)) for name, joint in servos.joints.items()}
     rows: list[dict[str, Any]] = []
-    for name, joint in there.items():
-        reading = readings[name]
-        angle = math.degrees(joint.angle(joint.unwrapped(reading.position)))
-        rows.append({"joint": name, "id": joint.id, "angle_deg": round(angle, 2), "count": reading.position})
-        rows[-1] |= {"offset": stored[name].offset, "limits": list(stored[name].limits)}
-        rows[-1] |= {"voltage_V": round(reading.voltage, 2), "temperature_C": reading.temperature}
-        rows[-1] |= {"torque": reading.has_torque, "alarms": list(reading.alarms)}
-    across = [name for name, joint in at.joints.items() if joint.crosses_seam]
+    for name, reading in readings.items():
+        there, volts = stored[name], reading["voltage"] * servos.bus.map.registers["voltage"].unit
+        rows.append(
+            {"joint": name, "id": joints[name].id, "angle_deg": round(math.degrees(servos.angle(name, reading)), 2)}
+        )
+        rows[-1] |= {"count": reading["position"], "offset": there["offset"], "limits": [there["min"], there["max"]]}
+        rows[-1] |= {"voltage_V": round(volts, 2), "temperature_C": reading["temperature"]}
+        rows[-1] |= {"torque": bool(reading["torque"]), "alarms": alarms[name]}
+    across = [name for name, joint in joints.items() if joint.crosses_seam]
     named = [{"joint": mistake.joint, "what": mistake.what, "mend": mistake.mend} for mistake in mistakes]
     console.result({"joints": rows, "mistakes": named, "ranges_over_the_seam": across})
     measured = ("joint", "id", "angle_deg", "count", "offset", "voltage_V", "temperature_C")
@@ -199,42 +190,35 @@ class Homing:
         return math.degrees(self.joint.settings.direction * _nearest(self.moved) * STEP)
 
 
-@dataclass(frozen=True)
-class Stated:
-    """What servos shall report or hold, by joint; joints that are not named stand at zero."""
+def planned(
+    servos: Servos, angles: Mapping[str, float], zeros: Mapping[str, float], offsets: Mapping[str, int]
+) -> list[Homing]:
+    """Offsets by which the joints' servos report what is stated; joints that are not named stand at zero.
 
-    angles: Mapping[str, float]  # where joints stand (rad)
-    zeros: Mapping[str, float]  # by how much they stand beyond what they report (rad)
-    offsets: Mapping[str, int]  # the offsets themselves (counts)
-
-    def offset(self, joint: ServoJoint, position: int, before: int) -> int:
-        """The homing offset of a servo that reports a position (counts) with another one."""
-        if joint.name in self.offsets:
-            return self.offsets[joint.name]
-        if joint.name in self.zeros and joint.name not in self.angles:
-            moved = round(joint.settings.direction * self.zeros[joint.name] / STEP)
-        else:
-            moved = round(joint.exact_count(self.angles.get(joint.name, 0.0))) - position
-        return _nearest(before + joint.model.map.offset_sign * moved)
-
-
-def planned(bus: Bus, joints: Mapping[str, ServoJoint], stated: Stated) -> list[Homing]:
-    """Offsets by which the joints' servos report what is stated where they stand.
+    Args:
+        servos: of the joints that are to be changed.
+        angles: where joints stand (rad).
+        zeros: by how much joints stand beyond what they report (rad).
+        offsets: the offsets themselves (counts).
 
     Raises:
         InputError: a servo holds no offset as large as needed, or is not let go; what to do is said.
         DeviceError: a servo does not answer well.
     """
-    readings = Servos(bus, joints).readings()
-    if holding := [name for name in joints if readings[name].has_torque]:
+    readings, bus = servos.readings(), servos.bus
+    if holding := [name for name, reading in readings.items() if reading["torque"]]:
         hint = "Hold the arm, and let its servos go with --release."
         raise InputError(f"{', '.join(holding)} hold, expected servos without torque.", where=bus.where, hint=hint)
     plans, mends = [], []
-    for name, joint in joints.items():
-        before, position = bus.number(joint.id, "offset"), readings[name].position
-        plans.append(Homing(joint, position, before, stated.offset(joint, position, before)))
+    for name, joint in servos.joints.items():
+        before, position = bus.number(joint.id, "offset"), readings[name]["position"]
+        moved = round(joint.exact_count(angles.get(name, 0.0))) - position
+        if name in zeros and name not in angles:
+            moved = round(joint.settings.direction * zeros[name] / STEP)
+        after = offsets.get(name, _nearest(before + bus.map.offset_sign * moved))
+        plans.append(Homing(joint, position, before, after))
         try:
-            check_offset(joint.model, plans[-1].after)
+            check_offset(joint.model, after)
         except ValueError as fault:
             mends.append(f"{name}: {fault}")
     if mends:
@@ -295,28 +279,26 @@ def home(
     Afterwards the servos report the angles at which you hold the arm, or those that a calibration found: of the joints
     that are named, or of all. The differences are shown first, and how to take them back.
     """
-    with _opened(config, overrides) as at:
+    with _opened(config, overrides) as (servos, checks):
         degrees, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
-        zeros = {} if calibration is None else _zeros(console, calibration, arm_name, at.joints)
+        zeros = {} if calibration is None else _zeros(console, calibration, arm_name, servos.joints)
         for name in (*degrees, *counts):
-            if name not in at.joints:
-                listed = ", ".join(at.joints)
+            if name not in servos.joints:
+                listed = ", ".join(servos.joints)
                 raise InputError(f"found no joint {name}, expected one of {listed}.", hint="Correct its name.")
-        chosen = {*degrees, *counts} or set(zeros) or set(at.joints)
-        joints = {name: joint for name, joint in at.joints.items() if name in chosen}
-        if release:
-            for joint in reversed(joints.values()):
-                Servos(at.bus, joints).release(joint)
-        stated = Stated({name: math.radians(angle) for name, angle in degrees.items()}, zeros, counts)
-        plans = planned(at.bus, joints, stated)
+        chosen = {*degrees, *counts} or set(zeros) or set(servos.joints)
+        servos.joints = {name: joint for name, joint in servos.joints.items() if name in chosen}
+        for name in reversed(servos.joints) if release else ():
+            servos.release(name)
+        plans = planned(servos, {name: math.radians(angle) for name, angle in degrees.items()}, zeros, counts)
         _show_plans(console, config, plans)
         if not yes and not sys.stdin.isatty():
             raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
         if not yes and not click.confirm("Write these offsets to the servos?", err=True):
             raise InputError("nothing was written.", hint="Say yes, or give --yes.")
-        at.checks.forget(joints)
+        checks.forget(servos.joints)
         for plan in plans:
-            write_offset(at.bus, plan)
+            write_offset(servos.bus, plan)
     changes = {p.joint.name: {"before": p.before, "after": p.after, "change_deg": p.change_deg} for p in plans}
     console.result({"offsets": changes})
     console.line("the offsets are written and read back.")

@@ -4,8 +4,7 @@ stream of an arm whose servos are guided by hand.
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 from armcal.base.settings import Temperature
@@ -28,122 +27,7 @@ from armcal.errors import ConfigError
 from pydantic import Field
 from typing_extensions import override
 
-from armcal_servobus.bus import SILENT_MEND, Bus, looked_at, present
-from armcal_servobus.joints import ServoJoint, ServoJointsSettings, ServoReading, Servos, bus_of, drivable
-
-_READ_TWICE = 2
-SEVERAL_TURNS = 0x10  # Of a Feetech servo's phase: it reports angles of several turns
-_ROUNDED = 2  # Counts: limits in a servo may be so much narrower than a range that was rounded
-
-
-@dataclass(frozen=True)
-class Stored:
-    """What a servo keeps without power."""
-
-    offset: int  # its homing offset (counts)
-    limits: tuple[int, int]  # the counts between which it lets itself be driven
-    max_temperature: float  # deg C
-    voltage_range: tuple[float, float]  # V
-    mode: int
-    phase: int  # of a Feetech servo: directions and units, as bits
-
-
-@dataclass(frozen=True)
-class Mistake:
-    """Something about a servo that is not as configured, and what to do. ``of_motion``: only one that moves minds."""
-
-    joint: str
-    what: str
-    mend: str
-    of_motion: bool = False
-
-
-def checked(bus: Bus, joints: Mapping[str, ServoJoint], *, moves: bool = True) -> dict[str, Stored]:
-    """What all joints' servos store, by joint, where all is as configured.
-
-    Args:
-        moves: whether they are to move.
-
-    Raises:
-        DeviceLostError: no servo answers at all.
-        DeviceRefusedError: something is not as configured; every fault is named.
-    """
-    stored, mistakes = examined(bus, joints)
-    mistakes = [mistake for mistake in mistakes if moves or not mistake.of_motion]
-    if not mistakes:
-        return stored
-    listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in mistakes)
-    hints = " ".join(dict.fromkeys(mistake.mend for mistake in mistakes))
-    raise DeviceRefusedError(f"found servos that are not as configured: {listed}.", where=bus.where, hint=hints)
-
-
-def examined(bus: Bus, joints: Mapping[str, ServoJoint]) -> tuple[dict[str, Stored], list[Mistake]]:
-    """What the servos of joints store, where they are the configured ones; and all that is not as configured.
-
-    Raises:
-        DeviceLostError: no servo answers at all.
-    """
-    servos = {name: looked_at(bus, joint.id, _READ_TWICE) for name, joint in joints.items()}
-    ids = {joint.id for joint in joints.values()}
-    strangers = [servo for servo in present(bus) if servo not in ids] if None in servos.values() else []
-    if not strangers and not any(servos.values()):
-        raise DeviceLostError(f"no servo answers at {bus.settings.baud} baud.", where=bus.where, hint=SILENT_MEND)
-    stored: dict[str, Stored] = {}
-    mistakes: list[Mistake] = []
-    for name, joint in joints.items():
-        servo, model = servos[name], joint.model
-        if servo is None:
-            listed = ", ".join(map(str, strangers))
-            mend = f"Found the id {listed}, which no joint has: is that the servo? Then give it the id {joint.id}."
-            mistakes.append(Mistake(joint.label, "does not answer", mend if strangers else SILENT_MEND))
-        elif servo.is_doubled:
-            what = f"answers damaged or twice ({servo.damaged} times)"
-            mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
-            mistakes.append(Mistake(joint.label, what, mend))
-        elif model.number not in (servo.number, None):
-            other = servo.model.name if servo.model else f"a model of number {servo.number}"
-            mend = f"Set model, or plug in the {model.name}; ids may be exchanged."
-            mistakes.append(Mistake(joint.label, f"is {other}, expected {model.name}", mend))
-        else:
-            stored[name] = _stored(bus, joint.id)
-            mistakes += _mistakes(joint, stored[name])
-    return stored, mistakes
-
-
-def _stored(bus: Bus, servo: int) -> Stored:
-    numbers, volt = bus.numbers((servo,), bus.map.stored)[servo], bus.map.registers["voltage"].unit
-    return Stored(
-        offset=numbers["offset"],
-        limits=(numbers["min"], numbers["max"]),
-        max_temperature=float(numbers["max_temperature"]),
-        voltage_range=(numbers["min_voltage"] * volt, numbers["max_voltage"] * volt),
-        mode=numbers["mode"],
-        phase=numbers.get("phase", 0),
-    )
-
-
-def _mistakes(joint: ServoJoint, stored: Stored) -> list[Mistake]:
-    """What a servo holds that does not fit its joint."""
-    mistakes = []
-    stated, mode = joint.settings.offset, joint.model.map.position_mode
-    if stated is not None and stated != stored.offset:
-        what = f"holds the homing offset {stored.offset}, expected {stated}"
-        mend = f"Write it with armcal bus home CONFIG --offset {joint.name}={stated}, or correct offset."
-        mistakes.append(Mistake(joint.label, what, mend))
-    if stored.mode != mode:
-        what = f"is in operating mode {stored.mode}, expected {mode} (positions)"
-        mistakes.append(Mistake(joint.label, what, "Set its mode with the maker's program.", True))
-    if stored.phase & SEVERAL_TURNS:
-        what = "reports angles of several turns (bit 4 of its phase, register 18)"
-        mistakes.append(Mistake(joint.label, what, "Clear that bit: armcal bus home does so."))
-    low, high = joint.count_range
-    if not joint.crosses_seam and (low + _ROUNDED < stored.limits[0] or high - _ROUNDED > stored.limits[1]):
-        what = f"stops at counts {stored.limits[0]} and {stored.limits[1]}, and its range is {low} to {high}"
-        ends = sorted(math.degrees(joint.angle(limit)) for limit in stored.limits)
-        mend = f"Narrow range_deg of {joint.name} to [{ends[0]:.1f}, {ends[1]:.1f}], or widen the limits in the servo."
-        mistakes.append(Mistake(joint.label, what, mend, True))
-    return mistakes
-
+from armcal_servobus.joints import ServoJoint, ServoJointsSettings, Servos, drivable
 
 _BLOCKED_S = 1.0
 _VOLTAGE_SLACK = 0.15
@@ -157,64 +41,8 @@ _MENDS: Mapping[str, str] = {
     "encoder": "Its encoder is damaged: exchange the servo.",
     "shock": "Its supply failed or its wiring is damaged: look at both, then switch its power off and on.",
 }
-
-
-class Health:
-    """Judges readings, one after the other.
-
-    Args:
-        joints: whose servos they are of.
-        stored: by joint, what their servos store.
-        temperature: that is borne (deg C).
-        load: share of full torque that is borne for a while.
-    """
-
-    def __init__(
-        self, joints: Mapping[str, ServoJoint], stored: Mapping[str, Stored], temperature: float, load: float
-    ) -> None:
-        self._joints, self._stored, self._temperature, self._load = joints, stored, temperature, load
-        self._loaded_since: dict[str, float] = {}
-        self._reported: set[tuple[str, str]] = set()
-
-    def check(self, readings: Mapping[str, ServoReading], now: float, powered: Collection[str] = ()) -> None:
-        """Readings of a moment (s) at which some joints shall hold.
-
-        Raises:
-            DeviceUnwellError: a servo is too hot, or blocked; once for each.
-            DeviceError: a servo reports an alarm, or has not its voltage.
-            DeviceResetError: one does not hold.
-        """
-        for name, reading in readings.items():
-            joint, stored = self._joints[name], self._stored[name]
-            if reading.alarms:
-                mends = " ".join(dict.fromkeys(_MENDS.get(word, "") for word in reading.alarms)).strip()
-                text = f"{joint.label} reports {' and '.join(reading.alarms)}."
-                raise DeviceError(text, hint=mends or "See the servo's manual.")
-            limit = min(self._temperature, stored.max_temperature)
-            if reading.temperature >= limit:
-                self._report(joint, f"is at {reading.temperature:.0f} deg C, expected below {limit:.0f}", "overheating")
-            low, high = stored.voltage_range
-            if not low - _VOLTAGE_SLACK <= reading.voltage <= high + _VOLTAGE_SLACK:
-                text = f"{joint.label} has {reading.voltage:.1f} V, expected {low:.1f} to {high:.1f}."
-                raise DeviceError(text, hint=_MENDS["voltage"])
-            if not (joint.model.knows_load and reading.has_torque and abs(reading.load) >= self._load):
-                self._loaded_since.pop(name, None)
-            elif now - self._loaded_since.setdefault(name, now) >= _BLOCKED_S:
-                text = f"works with {100 * abs(reading.load):.0f} % of its torque for {_BLOCKED_S:g} s"
-                self._report(joint, text, "load")
-        limp = [self._joints[name].label for name in readings if name in powered and not readings[name].has_torque]
-        if limp:
-            text = f"{', '.join(limp)} lost torque by itself: started anew, or gave up under load."
-            raise DeviceResetError(text, hint="Look at the supply and the plugs, and whether the joint is blocked.")
-
-    def _report(self, joint: ServoJoint, what: str, fault: str) -> None:
-        """The first time only: on its way to where it parks the arm is not stopped by it."""
-        if (joint.name, fault) not in self._reported:
-            self._reported.add((joint.name, fault))
-            raise DeviceUnwellError(f"{joint.label} {what}.", hint=_MENDS[fault])
-
-
 _SETTLES_S = 0.02
+_AGAIN_S = 0.5
 
 
 class ServoBusSettings(ServoJointsSettings):
@@ -244,14 +72,14 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     }
 
     def __init__(self, settings: ServoBusSettings, joint_names: Sequence[str], link: Link | None = None) -> None:
-        self._settings = settings
-        self._joints: dict[str, ServoJoint] = settings.chosen(joint_names)
+        self._settings, self._servos = settings, Servos(settings, joint_names)
+        self._joints, self._bus = self._servos.joints, self._servos.bus
         drivable(self._joints.values())
-        self._bus = bus_of(settings, self._joints)
-        self._servos = Servos(self._bus, self._joints)
-        self._health: Health | None = None  # None: it is not open
         self._clock: Clock = RealClock()
+        self._is_open = False
         self._powered: set[str] = set()
+        self._loaded_since: dict[str, float] = {}
+        self._reported: set[tuple[str, str]] = set()
 
     @property
     @override
@@ -261,86 +89,83 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     @override
     def open(self, clock: Clock) -> DeviceIdentity:
         self.close()
-        self._clock, s = clock, self._settings
+        self._clock, self._loaded_since, self._reported = clock, {}, set()
+        adapter = self._servos.open()
         try:
-            adapter = self._bus.open()
-            stored = checked(self._bus, self._joints)
-            health = Health(self._joints, stored, s.temperature, s.load_percent / 100)
             readings = self._servos.readings()
-            health.check(readings, clock.now())
+            self._check(readings)
             for joint, reading in readings.items():  # one that has started anew may hold, and knows no limit
-                if reading.has_torque:
-                    self._limit_motion(self._joints[joint])
+                if reading["torque"]:
+                    self._limit_motion(joint)
                     self._powered.add(joint)
-            self._health = health
+            self._is_open = True
         except BaseException:
             self.close()
             raise
-        models = ", ".join(sorted({joint.model.name for joint in self._joints.values()}))
-        name = f"{len(self._joints)} servos ({models}) on {adapter or 'an adapter without an id'} at {s.baud} baud"
+        models, baud = ", ".join(sorted({joint.model.name for joint in self._joints.values()})), self._settings.baud
+        name = f"{len(self._joints)} servos ({models}) on {adapter or 'an adapter without an id'} at {baud} baud"
         parts: dict[str, Any] = {}
         for joint, servo in self._joints.items():
-            parts[joint] = {"id": servo.id, "model": servo.model.name, "offset": stored[joint].offset}
+            parts[joint] = {"id": servo.id, "model": servo.model.name, "offset": self._servos.stored[joint]["offset"]}
             parts[joint] |= {"zero_count": servo.settings.zero_count, "direction": servo.settings.direction}
         return DeviceIdentity(name, identity_of(parts), None, adapter)
 
     @override
     def state(self) -> DeviceState:
-        self._opened()
-        readings = self._servos.readings()
-        self._powered = {joint for joint, reading in readings.items() if reading.has_torque}
-        goals = {joint: readings[joint].goal for joint in self._joints if joint in self._powered}
+        readings = self._opened().readings()
+        self._powered = {joint for joint, reading in readings.items() if reading["torque"]}
+        goals = {joint: readings[joint]["goal"] for joint in self._joints if joint in self._powered}
         return DeviceState({joint: self._joints[joint].angle(goal) for joint, goal in goals.items()})
 
     @override
     def standing(self, angles: Mapping[str, float]) -> dict[str, float]:
-        servos = {joint: self._servo(joint) for joint in angles}
-        return {joint: servo.angle(servo.count(angles[joint])) for joint, servo in servos.items()}
+        servos = self._joints
+        return {joint: servos[joint].angle(servos[joint].count(angle)) for joint, angle in angles.items()}
 
     @override
     def measured(self) -> dict[str, float]:
-        self._opened()
-        readings = self._servos.readings()
-        return {joint: servo.angle(servo.unwrapped(readings[joint].position)) for joint, servo in self._joints.items()}
+        servos = self._opened()
+        return {joint: servos.angle(joint, reading) for joint, reading in servos.readings().items()}
 
     @override
     def energise(self, joint: str, angle: float) -> None:
         """Hold the joint where it stands, then turn it to the angle at the speed that is set: it does not jump."""
-        self._opened()
-        servo = self._servo(joint)
+        servos, servo = self._opened(), self._joints[joint]
         goal = servo.count(angle)
         if joint not in self._powered:
-            self._limit_motion(servo)
+            self._limit_motion(joint)
             here = servo.unwrapped(self._bus.number(servo.id, "position"))
             low, high = servo.count_range
             if not low <= here <= high:
                 servo.count(servo.angle(here))  # refuses what is further out than a count
-            self._servos.hold(servo, min(max(here, low), high))
+            servos.hold(joint, min(max(here, low), high))
             self._powered.add(joint)
-        self._servos.command({joint: goal})
+        servos.command({joint: goal})
         self._clock.sleep(_SETTLES_S)
 
     @override
     def command(self, angles: Mapping[str, float]) -> None:
-        self._opened()
-        goals = {joint: self._servo(joint).count(angle) for joint, angle in angles.items()}
+        servos = self._opened()
+        goals = {joint: self._joints[joint].count(angle) for joint, angle in angles.items()}
         limp = [joint for joint in goals if joint not in self._powered]
         if limp:
             text = f"found commands for {', '.join(limp)}, which hang free."
             raise DeviceRefusedError(text, where=self._bus.where, hint="Energise them first, one at a time.")
-        self._servos.command(goals)
+        servos.command(goals)
 
     @override
     def keep_alive(self) -> None:
         """Read all servos, and send once more what did not arrive.
 
         Raises:
-            DeviceError: one is unwell, or blocked.
+            DeviceUnwellError: one is too hot, or blocked; once for each.
+            DeviceError: one reports an alarm, or has not its voltage.
             DeviceResetError: one has lost its torque.
         """
-        health, readings = self._opened(), self._servos.readings()
-        health.check(readings, self._clock.now(), self._powered)
-        self._servos.repeat(readings, self._powered)
+        servos = self._opened()
+        readings = servos.readings()
+        self._check(readings)
+        servos.repeat(readings, self._powered)
 
     @override
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
@@ -349,33 +174,55 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
 
     @override
     def release(self, joint: str) -> None:
-        self._opened()
-        servo = self._servo(joint)
+        servos = self._opened()
         self._powered.discard(joint)
-        self._servos.release(servo)
+        servos.release(joint)
 
     @override
     def close(self) -> None:
-        self._health, self._powered = None, set()
+        self._is_open, self._powered = False, set()
         self._bus.close()
 
-    def _limit_motion(self, servo: ServoJoint) -> None:
+    def _check(self, readings: Mapping[str, Mapping[str, int]]) -> None:
+        """Judge readings of this moment; see ``keep_alive``."""
+        settings, registers, now = self._settings, self._bus.map.registers, self._clock.now()
+        volt = registers["voltage"].unit
+        for name, reading in readings.items():
+            joint, stored = self._joints[name], self._servos.stored[name]
+            if alarms := self._bus.alarms(joint.id):
+                mends = " ".join(dict.fromkeys(_MENDS.get(word, "") for word in alarms)).strip()
+                raise DeviceError(f"{joint.label} reports {' and '.join(alarms)}.", hint=mends or "See its manual.")
+            limit = min(settings.temperature, stored["max_temperature"])
+            if reading["temperature"] >= limit:
+                self._report(joint, f"is at {reading['temperature']} deg C, expected below {limit:.0f}", "overheating")
+            low, high = stored["min_voltage"] * volt, stored["max_voltage"] * volt
+            if not low - _VOLTAGE_SLACK <= (voltage := reading["voltage"] * volt) <= high + _VOLTAGE_SLACK:
+                text = f"{joint.label} has {voltage:.1f} V, expected {low:.1f} to {high:.1f}."
+                raise DeviceError(text, hint=_MENDS["voltage"])
+            percent = 100 * abs(reading["load"] * registers["load"].unit)
+            if not (joint.model.knows_load and reading["torque"] and percent >= settings.load_percent):
+                self._loaded_since.pop(name, None)
+            elif now - self._loaded_since.setdefault(name, now) >= _BLOCKED_S:
+                self._report(joint, f"works with {percent:.0f} % of its torque for {_BLOCKED_S:g} s", "load")
+        limp = [self._joints[name].label for name in readings if name in self._powered and not readings[name]["torque"]]
+        if limp:
+            text = f"{', '.join(limp)} lost torque by itself: started anew, or gave up under load."
+            raise DeviceResetError(text, hint="Look at the supply and the plugs, and whether the joint is blocked.")
+
+    def _report(self, joint: ServoJoint, what: str, fault: str) -> None:
+        """The first time only: on its way to where it parks the arm is not stopped by it."""
+        if (joint.name, fault) not in self._reported:
+            self._reported.add((joint.name, fault))
+            raise DeviceUnwellError(f"{joint.label} {what}.", hint=_MENDS[fault])
+
+    def _limit_motion(self, joint: str) -> None:
         limits = self._settings.speed_deg_per_s, self._settings.acceleration_deg_per_s2
-        self._servos.set_motion(servo, *map(math.radians, limits))
+        self._servos.set_motion(joint, *map(math.radians, limits))
 
-    def _servo(self, joint: str) -> ServoJoint:
-        if joint not in self._joints:
-            text = f"found the joint {joint!r}, expected one of {', '.join(self._joints)}."
-            raise DeviceRefusedError(text, where=self._bus.where, hint="Name a joint of the arm.")
-        return self._joints[joint]
-
-    def _opened(self) -> Health:
-        if self._health is None:
+    def _opened(self) -> Servos:
+        if not self._is_open:
             raise DeviceLostError("the device is not open.", where=self._bus.where, hint="Open it.")
-        return self._health
-
-
-_AGAIN_S = 0.5
+        return self._servos
 
 
 class ServoStreamSettings(ServoJointsSettings):
@@ -401,23 +248,27 @@ class ServoBusStream(JointStream):
     def __init__(self, settings: ServoStreamSettings) -> None:
         self._settings = settings
         self._refused: Counter[str] = Counter()
-        self._joints: dict[str, ServoJoint] = {}
         self._clock: Clock = RealClock()
         self._next = 0.0
-        self._bus: Bus | None = None
+        self._servos: Servos | None = None
 
     @override
     def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
         self.close()
         try:
-            self._joints = self._settings.chosen(channels)
+            servos = Servos(self._settings, channels)
         except ValueError as fault:
             raise ConfigError(f"bench.joints: {fault}.", hint="Give each joint its servo.") from fault
-        self._bus, self._clock, self._next = bus_of(self._settings, self._joints), clock, clock.now()
+        self._servos, self._clock, self._next = servos, clock, clock.now()
         try:
-            self._bus.open()
-            checked(self._bus, self._joints, moves=False)
-            self._let_go(Servos(self._bus, self._joints))
+            servos.open(moves=False)
+            holding = [name for name, reading in servos.readings().items() if reading["torque"]]
+            if holding and self._settings.torque == "refuse":
+                text = f"{', '.join(holding)} hold, expected servos without torque, which can be guided by hand."
+                hint = "Hold the arm, and give bench.joints: {torque: release}, which lets them go."
+                raise DeviceRefusedError(text, hint=hint)
+            for name in reversed(holding):
+                servos.release(name)
         except DeviceLostError as fault:
             self.close()
             raise DeviceRefusedError(fault.message, where=fault.where, hint=fault.hint) from fault
@@ -427,26 +278,25 @@ class ServoBusStream(JointStream):
 
     @override
     def samples(self) -> list[JointSample]:
-        if self._bus is None or (now := self._clock.now()) < self._next:
+        if self._servos is None or (now := self._clock.now()) < self._next:
             return []
         self._next = now + 1 / self._settings.rate_hz
         try:
-            readings = Servos(self._bus, self._joints).readings()
+            readings = self._servos.readings()
         except DeviceError as fault:
             self._refused[fault.message] += 1
             self._next = now + _AGAIN_S
             try:
-                self._bus.open()
+                self._servos.bus.open()
             except (DeviceError, DeviceRefusedError) as again:
                 self._refused[again.message] += 1
             return []
-        angles = {name: joint.angle(joint.unwrapped(readings[name].position)) for name, joint in self._joints.items()}
-        return [JointSample(now, None, angles)]
+        return [JointSample(now, None, {name: self._servos.angle(name, row) for name, row in readings.items()})]
 
     @property
     @override
     def ended(self) -> bool:
-        return self._bus is None
+        return self._servos is None
 
     @property
     @override
@@ -455,15 +305,6 @@ class ServoBusStream(JointStream):
 
     @override
     def close(self) -> None:
-        if self._bus is not None:
-            self._bus.close()
-        self._bus = None
-
-    def _let_go(self, servos: Servos) -> None:
-        holding = [name for name, reading in servos.readings().items() if reading.has_torque]
-        if holding and self._settings.torque == "refuse":
-            text = f"{', '.join(holding)} hold, expected servos without torque, which can be guided by hand."
-            hint = "Hold the arm, and give bench.joints: {torque: release}, which lets them go."
-            raise DeviceRefusedError(text, hint=hint)
-        for name in reversed(holding):
-            servos.release(self._joints[name])
+        if self._servos is not None:
+            self._servos.bus.close()
+        self._servos = None

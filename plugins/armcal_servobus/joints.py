@@ -1,4 +1,4 @@
-"""The joints of a servo bus: which servo each is, which count is which angle, and how they are driven."""
+"""The joints of a servo bus: which servo each is, which count is which angle, how they are compared and driven."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from armcal.arm.servo import teeth_text
 from armcal.base.settings import Settings, UnitOf
-from armcal.devices.device import DeviceError, DeviceRefusedError
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.errors import Location
 from pydantic import Field, field_validator, model_validator
 
-from armcal_servobus.bus import LAST_ID, Bus, BusSettings
+from armcal_servobus.bus import LAST_ID, SILENT_MEND, Bus, BusSettings, looked_at, present
 from armcal_servobus.models import COUNTS, MODELS, STEP, ServoModel
 
+SEVERAL_TURNS = 0x10  # Of a Feetech servo's phase: it reports angles of several turns
 _SLACK = 1e-9
+_READ_TWICE = 2
+_ROUNDED = 2  # Counts: limits in a servo may be so much narrower than a range that was rounded
+_FASTEST = 32767  # As the registers have it, in which zero is no limit
 AngleRange = Annotated[tuple[float, float], UnitOf("angle")]
 
 
@@ -182,100 +186,144 @@ def drivable(joints: Collection[ServoJoint]) -> None:
             )
 
 
-def bus_of(settings: ServoJointsSettings, joints: Mapping[str, ServoJoint]) -> Bus:
-    """The bus, which names these joints in what it says."""
-    return Bus(settings, {joint.id: name for name, joint in joints.items()})
+class Mistake(NamedTuple):
+    """Something about a servo that is not as configured, and what to do. ``of_motion``: only one that moves minds."""
 
-
-_FASTEST = 32767  # As the registers have it, in which zero is no limit
-
-
-@dataclass(frozen=True)
-class ServoReading:
-    """What a servo says while it works."""
-
-    position: int  # counts
-    goal: int
-    has_torque: bool  # whether it holds
-    load: float  # share of full torque (-1 to 1); of no meaning where the model does not know it
-    voltage: float  # V
-    temperature: float  # deg C
-    alarms: tuple[str, ...] = ()  # in words
+    joint: str
+    what: str
+    mend: str
+    of_motion: bool = False
 
 
 class Servos:
-    """All of a bus; each call is an exchange or two for all of them."""
+    """The servos of joints on their bus; each call is an exchange or two for all of them.
 
-    def __init__(self, bus: Bus, joints: Mapping[str, ServoJoint]) -> None:
-        self._bus, self._joints = bus, joints
+    Attributes:
+        joints: by name.
+        stored: what servos keep without power, by joint and register; of those that were as configured in ``examine``.
+    """
+
+    def __init__(self, settings: ServoJointsSettings, names: Iterable[str]) -> None:
+        self.joints = settings.chosen(names)
+        self.bus = Bus(settings, {joint.id: name for name, joint in self.joints.items()})
+        self.stored: dict[str, dict[str, int]] = {}
         self._goals: dict[str, int] = {}
         self._speeds: dict[str, int] = {}
 
-    def readings(self) -> dict[str, ServoReading]:
-        """Of all joints.
+    def open(self, *, moves: bool = True) -> str:
+        """Open the bus; gives the adapter's serial number where all is as configured.
+
+        Args:
+            moves: whether joints are to move.
+
+        Raises:
+            DeviceLostError: no servo answers at all.
+            DeviceRefusedError: something is not as configured; every fault is named.
+        """
+        try:
+            adapter = self.bus.open()
+            mistakes = [mistake for mistake in self.examine() if moves or not mistake.of_motion]
+            if mistakes:
+                listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in mistakes)
+                text, hints = f"found servos that are not as configured: {listed}.", (m.mend for m in mistakes)
+                raise DeviceRefusedError(text, where=self.bus.where, hint=" ".join(dict.fromkeys(hints)))
+        except BaseException:
+            self.bus.close()
+            raise
+        return adapter
+
+    def examine(self) -> list[Mistake]:
+        """Read what the servos store; gives all that is not as configured.
+
+        Raises:
+            DeviceLostError: no servo answers at all.
+        """
+        bus, joints = self.bus, self.joints
+        servos = {name: looked_at(bus, joint.id, _READ_TWICE) for name, joint in joints.items()}
+        ids = {joint.id for joint in joints.values()}
+        strangers = [servo for servo in present(bus) if servo not in ids] if None in servos.values() else []
+        if not strangers and not any(servos.values()):
+            raise DeviceLostError(f"no servo answers at {bus.settings.baud} baud.", where=bus.where, hint=SILENT_MEND)
+        self.stored, mistakes = {}, list[Mistake]()
+        for name, joint in joints.items():
+            servo, model = servos[name], joint.model
+            if servo is None:
+                listed = ", ".join(map(str, strangers))
+                mend = f"Found the id {listed}, which no joint has: is that the servo? Then give it the id {joint.id}."
+                mistakes.append(Mistake(joint.label, "does not answer", mend if strangers else SILENT_MEND))
+            elif servo.is_doubled:
+                what = f"answers damaged or twice ({servo.damaged} times)"
+                mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
+                mistakes.append(Mistake(joint.label, what, mend))
+            elif model.number not in (servo.number, None):
+                other = servo.model.name if servo.model else f"a model of number {servo.number}"
+                mend = f"Set model, or plug in the {model.name}; ids may be exchanged."
+                mistakes.append(Mistake(joint.label, f"is {other}, expected {model.name}", mend))
+            else:
+                self.stored[name] = bus.numbers((joint.id,), bus.map.stored)[joint.id]
+                mistakes += _mistakes(joint, self.stored[name])
+        return mistakes
+
+    def readings(self) -> dict[str, dict[str, int]]:
+        """What changes while servos work, by joint and register, as it stands there.
 
         Raises:
             DeviceError: one does not answer, or not well.
         """
-        registers = self._bus.map.registers
-        by_id = self._bus.numbers([joint.id for joint in self._joints.values()], *self._bus.map.polled)
-        return {
-            name: ServoReading(
-                position=numbers["position"],
-                goal=numbers["goal"],
-                has_torque=bool(numbers["torque"]),
-                load=numbers["load"] * registers["load"].unit,
-                voltage=numbers["voltage"] * registers["voltage"].unit,
-                temperature=float(numbers["temperature"]),
-                alarms=self._bus.alarms(self._joints[name].id),
-            )
-            for name, numbers in zip(self._joints, by_id.values(), strict=True)
-        }
+        by_id = self.bus.numbers([joint.id for joint in self.joints.values()], *self.bus.map.polled)
+        return dict(zip(self.joints, by_id.values(), strict=True))
 
-    def set_motion(self, joint: ServoJoint, speed: float, acceleration: float) -> None:
+    def angle(self, name: str, reading: Mapping[str, int]) -> float:
+        """Where a joint stands (rad) by a reading."""
+        joint = self.joints[name]
+        return joint.angle(joint.unwrapped(reading["position"]))
+
+    def set_motion(self, name: str, speed: float, acceleration: float) -> None:
         """How fast a servo turns by itself at most (rad/s, rad/s^2). Zero would be no limit, so it is never written."""
-        for name, value in (("acceleration", acceleration), ("speed", speed)):
-            register = self._bus.map.registers[name]
+        for key, value in (("acceleration", acceleration), ("speed", speed)):
+            register = self.bus.map.registers[key]
             most = 254 if register.size == 1 else _FASTEST
             number = min(max(round(value / register.unit), 1), most)
-            self._bus.set_number(joint.id, name, number)
-        self._speeds[joint.name] = number
+            self.bus.set_number(self.joints[name].id, key, number)
+        self._speeds[name] = number
 
-    def hold(self, joint: ServoJoint, count: int) -> None:
+    def hold(self, name: str, count: int) -> None:
         """Torque on, at a count that is where it stands."""
-        self._bus.set_number(joint.id, "goal", count)
-        self._bus.set_number(joint.id, "torque", 1)
-        self._bus.set_number(joint.id, "goal", count)  # some servos set their goal anew when torque comes on
-        self._goals[joint.name] = count
+        servo = self.joints[name].id
+        self.bus.set_number(servo, "goal", count)
+        self.bus.set_number(servo, "torque", 1)
+        self.bus.set_number(servo, "goal", count)  # some servos set their goal anew when torque comes on
+        self._goals[name] = count
 
-    def release(self, joint: ServoJoint) -> None:
+    def release(self, name: str) -> None:
         """Torque off, read back.
 
         Raises:
             DeviceError: it is still on.
         """
-        self._goals.pop(joint.name, None)
-        self._bus.set_number(joint.id, "torque", 0)
-        if self._bus.number(joint.id, "torque"):
+        self._goals.pop(name, None)
+        joint = self.joints[name]
+        self.bus.set_number(joint.id, "torque", 0)
+        if self.bus.number(joint.id, "torque"):
             text = f"the torque of {joint.label} did not go off."
-            raise DeviceError(text, where=self._bus.where, hint="Hold the arm and switch the servos' power off.")
+            raise DeviceError(text, where=self.bus.where, hint="Hold the arm and switch the servos' power off.")
 
     def command(self, goals: Mapping[str, int]) -> None:
         """Goals of joints whose motion was set, all at once."""
         self._goals |= goals
-        written = {self._joints[name].id: self._goal_bytes(name) for name in goals}
-        self._bus.write_all(self._bus.map.registers["goal"].address, written)
+        written = {self.joints[name].id: self._goal_bytes(name) for name in goals}
+        self.bus.write_all(self.bus.map.registers["goal"].address, written)
 
-    def repeat(self, readings: Mapping[str, ServoReading], powered: Collection[str]) -> None:
+    def repeat(self, readings: Mapping[str, Mapping[str, int]], powered: Collection[str]) -> None:
         """Command once more what did not arrive: a goal for all at once is acknowledged by nobody.
 
         Raises:
             DeviceError: a servo does not take its goal.
         """
         for name, goal in self._goals.items():
-            if name in powered and readings[name].goal != goal:
-                address = self._bus.map.registers["goal"].address
-                self._bus.write(self._joints[name].id, address, self._goal_bytes(name))
+            if name in powered and readings[name]["goal"] != goal:
+                address = self.bus.map.registers["goal"].address
+                self.bus.write(self.joints[name].id, address, self._goal_bytes(name))
 
     def _goal_bytes(self, name: str) -> bytes:
         """A goal, and the speed in the same go where its register follows.
@@ -283,6 +331,29 @@ class Servos:
         A servo that started anew has forgotten its speed, and some switch their torque on with the next goal. Zero
         between the two is a time to be taken of some servos: the speed holds.
         """
-        goal, speed = (self._bus.map.registers[register] for register in ("goal", "speed"))
+        goal, speed = (self.bus.map.registers[register] for register in ("goal", "speed"))
         data, between = goal.pack(self._goals[name]), speed.address - goal.address - goal.size
         return data + bytes(between) + speed.pack(self._speeds[name]) if between >= 0 else data
+
+
+def _mistakes(joint: ServoJoint, stored: Mapping[str, int]) -> list[Mistake]:
+    """What a servo holds that does not fit its joint."""
+    mistakes = []
+    stated, mode, least, most = joint.settings.offset, joint.model.map.position_mode, stored["min"], stored["max"]
+    if stated is not None and stated != stored["offset"]:
+        what = f"holds the homing offset {stored['offset']}, expected {stated}"
+        mend = f"Write it with armcal bus home CONFIG --offset {joint.name}={stated}, or correct offset."
+        mistakes.append(Mistake(joint.label, what, mend))
+    if stored["mode"] != mode:
+        what = f"is in operating mode {stored['mode']}, expected {mode} (positions)"
+        mistakes.append(Mistake(joint.label, what, "Set its mode with the maker's program.", True))
+    if stored.get("phase", 0) & SEVERAL_TURNS:
+        what = "reports angles of several turns (bit 4 of its phase, register 18)"
+        mistakes.append(Mistake(joint.label, what, "Clear that bit: armcal bus home does so."))
+    low, high = joint.count_range
+    if not joint.crosses_seam and (low + _ROUNDED < least or high - _ROUNDED > most):
+        what = f"stops at counts {least} and {most}, and its range is {low} to {high}"
+        ends = sorted(math.degrees(joint.angle(limit)) for limit in (least, most))
+        mend = f"Narrow range_deg of {joint.name} to [{ends[0]:.1f}, {ends[1]:.1f}], or widen the limits in the servo."
+        mistakes.append(Mistake(joint.label, what, mend, True))
+    return mistakes

@@ -13,8 +13,8 @@ from armcal.cli.main import cli
 from armcal.config.yaml_source import load_config
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
-from armcal_servobus.command import Stated, planned
-from armcal_servobus.joints import ServoJointsSettings
+from armcal_servobus.command import planned
+from armcal_servobus.joints import ServoJointsSettings, Servos
 from click.testing import CliRunner, Result
 
 from tests.plugins.servobus.fake_bus import FakeBus, sts
@@ -94,8 +94,8 @@ def test_home_sets_offsets_and_restores_them(tmp_path, model):
     try:
         protocol = desk.servos[0].table.protocol
         config = written(tmp_path, desk.path, model, protocol=protocol)
-        desk.servos[0].motor._gear = desk.servos[0].motor.target = 0.2
-        desk.servos[1].motor._gear = desk.servos[1].motor.target = -0.1
+        desk.servos[0].motor.shaft = desk.servos[0].motor.target = 0.2
+        desk.servos[1].motor.shaft = desk.servos[1].motor.target = -0.1
         ran = called("home", config, "--at", "q1=0", "--at", "q2=30", "--yes", "--json")
         offsets = json.loads(ran.stdout)["offsets"]
         assert offsets["q1"]["change_deg"] == pytest.approx(-math.degrees(0.2), abs=0.1)
@@ -124,15 +124,13 @@ def test_home_asks_and_writes_nothing_unasked(tmp_path):
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
 
 
-def joints_of(fake: FakeBus, model: str = "sts3215"):
-    from armcal_servobus.bus import Bus
-
+def servos_of(fake: FakeBus, model: str = "sts3215"):
     servo = {"model": model, "range_deg": [-100, 100]}
     joints = {"q1": {"id": 1, **servo}, "q2": {"id": 2, "direction": -1, **servo}}
     settings = ServoJointsSettings.model_validate({"port": fake.path, "joints": joints})
-    bus = Bus(settings)
-    bus.open()
-    return bus, settings.chosen(joints)
+    servos = Servos(settings, joints)
+    servos.bus.open()
+    return servos
 
 
 def test_offsets_at_the_ends_of_the_register(tmp_path):
@@ -143,9 +141,9 @@ def test_offsets_at_the_ends_of_the_register(tmp_path):
         assert not [i for i in fake.instructions if i[1] in (3, 0x83)]
         for count, offset in ((1, -2047), (4095, 2047), (2049, 1)):
             fake.servos[0].memory[56:58] = count.to_bytes(2, "little")
-            bus, joints = joints_of(fake)
-            assert planned(bus, joints, Stated({}, {}, {}))[0].after == offset
-            bus.close()
+            servos = servos_of(fake)
+            assert planned(servos, {}, {}, {})[0].after == offset
+            servos.bus.close()
 
 
 def test_what_was_checked_lasts_until_offsets_are_written(tmp_path):

@@ -80,7 +80,7 @@ def test_it_drives_them(desk):
     made, clock = device(desk), DeskClock(desk)
     made.open(clock)
     assert made.state().angles == {} and not any(servo.get("torque_enable") for servo in desk.servos)
-    desk.servos[0].motor._gear = 0.3
+    desk.servos[0].motor.shaft = 0.3
     measured = made.measured()
     assert measured["q1"] == pytest.approx(0.3, abs=0.004)
     for joint in JOINTS:
