@@ -10,10 +10,8 @@ import click
 from armcal.cli.common import FILE, Console, speaking
 from armcal.errors import InputError
 
-from armcal_lerobot.motor_file import Units, read_motors
-
 if TYPE_CHECKING:
-    from armcal_lerobot.arm import Gripper
+    from armcal_lerobot.motor_files import Gripper, Units
     from armcal_lerobot.recordings import Recording
 
 _ABOVE_ZERO = click.FloatRange(min=0, min_open=True)
@@ -49,7 +47,8 @@ def _on_dataset(command: Any) -> Any:
     return click.argument("dataset", type=FILE)(click.option("--calibration", type=FILE, help=text)(_UNITS(command)))
 
 
-def _recording(dataset: Path, units: Units, calibration: Path | None) -> "Recording":
+def _recording(dataset: Path, units: "Units", calibration: Path | None) -> "Recording":
+    from armcal_lerobot.motor_files import read_motors
     from armcal_lerobot.recordings import open_recording
 
     return open_recording(dataset, units, read_motors(calibration) if calibration else None)
@@ -61,12 +60,12 @@ def _recording(dataset: Path, units: Units, calibration: Path | None) -> "Record
 @_UNITS
 @_of_arm
 @speaking
-def check(console: Console, calibration: Path, other: Path | None, units: Units, **of_arm: Any) -> None:
+def check(console: Console, calibration: Path, other: Path | None, units: "Units", **of_arm: Any) -> None:
     """Check a calibration file; what its zeros cost in mm.
 
     With OTHER (yesterday's file and today's) also how far the same command moves each joint, and the gripper.
     """
-    from armcal_lerobot.arm import checked
+    from armcal_lerobot.motor_files import checked, read_motors
 
     file, second = read_motors(calibration), read_motors(other) if other else None
     console.show(checked(file, second, _gripper(console, list(file.motors), **of_arm), units))
@@ -79,7 +78,7 @@ def check(console: Console, calibration: Path, other: Path | None, units: Units,
 @speaking
 def joints(console: Console, calibration: Path, model: str, **of_arm: Any) -> None:
     """A calibration file as sections of a configuration: the joints of a servo bus, and limits of a plan."""
-    from armcal_lerobot.arm import bus_joints
+    from armcal_lerobot.motor_files import bus_joints, read_motors
 
     file = read_motors(calibration)
     text = bus_joints(file, _gripper(console, list(file.motors), **of_arm), model)
@@ -105,7 +104,7 @@ def zeros(
     """
     from armcal.calibration.joint_zeros import zeros_of
 
-    from armcal_lerobot.arm import require_not_written, rezeroed, wiring_of
+    from armcal_lerobot.motor_files import read_motors, require_not_written, rezeroed, wiring_of
 
     file = read_motors(calibration)
     calibrated_zeros, kept = zeros_of(calibrated, arm_name, console.registry())
@@ -139,7 +138,7 @@ def zeros(
 @lerobot.command()
 @_on_dataset
 @speaking
-def compare(console: Console, dataset: Path, units: Units, calibration: Path | None) -> None:
+def compare(console: Console, dataset: Path, units: "Units", calibration: Path | None) -> None:
     """How a follower follows its commands, joint by joint.
 
     Offset, gain, backlash and delay from recorded data, with intervals.
@@ -162,7 +161,7 @@ def compare(console: Console, dataset: Path, units: Units, calibration: Path | N
 def rests(
     console: Console,
     dataset: Path,
-    units: Units,
+    units: "Units",
     calibration: Path | None,
     out: Path,
     camera: str | None,
@@ -195,7 +194,7 @@ def _gripper(
         if joints or arm_name:
             raise InputError("found --joint or --arm-name without --arm.", hint="Give --arm CONFIG.")
         return None
-    from armcal_lerobot.arm import Gripper
+    from armcal_lerobot.motor_files import Gripper
 
     return Gripper(config, arm_name, motors, joints, console.registry())
 

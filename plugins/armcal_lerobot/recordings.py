@@ -2,7 +2,8 @@
 camera's images of these moments.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,12 @@ from armcal.measure.csv_writer import csv_text
 from armcal.measure.rests import StillSettings, rests
 from armcal.plugins import library
 
-from armcal_lerobot.arm import wiring_of
-from armcal_lerobot.motor_file import MotorFile, Units, is_gripper, read_json, require_motors
+from armcal_lerobot.motor_files import MotorFile, Units, is_gripper, read_json, require_motors, wiring_of
 
 STATE, ACTION = "observation.state", "action"
 _MAX_META = 64 << 20
-_MOST_FRAMES = 5_000_000  # 46 hours at 30 frames a second: they are in memory at once
 _ROWS_AT_ONCE = 4096
+_MOST_FRAMES = 5_000_000  # 46 hours at 30 frames a second: they are in memory at once
 _VERSIONS = ("v2.0", "v2.1", "v3.")
 _WHOLE = "Take it whole from where it was recorded."
 _MOST_PERCENT = 105.0
@@ -71,12 +71,12 @@ class Recording:
         path = next(videos.glob(f"chunk-*/{camera}/episode_{episode:06d}.mp4"), videos / camera)
         if self.version.startswith("v3"):
             columns = tuple(f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))
-            tables = sorted((self.folder / "meta" / "episodes").glob("chunk-*/*.parquet"))
-            for _, batch in _batches(tables, ("episode_index", *columns)):
-                numbers = batch.column("episode_index").to_pylist()
-                if episode in numbers and columns[0] in batch.schema.names:
-                    chunk, file, start = (batch.column(name)[numbers.index(episode)].as_py() for name in columns)
-                    path = videos / camera / f"chunk-{int(chunk):03d}" / f"file-{int(file):03d}.mp4"
+            for file in sorted((self.folder / "meta" / "episodes").glob("chunk-*/*.parquet")):
+                with _parquet(file) as table:
+                    rows = table.read(["episode_index", *columns], use_threads=False).to_pylist()
+                for row in (row for row in rows if row.get("episode_index") == episode and columns[0] in row):
+                    chunk, number, start = (row[name] for name in columns)
+                    path = videos / camera / f"chunk-{int(chunk):03d}" / f"file-{int(number):03d}.mp4"
                     first = round(float(start) * self.fps)
         if not path.is_file():
             hint = "Name a camera of the data set, or take its videos too."
@@ -136,14 +136,29 @@ def _motors(features: Any, feature: str, where: Location) -> tuple[str, ...]:
 def _rows(folder: Path, frames: int, motors: int) -> Array:
     """All frames as stored (N x (3 + 2 motors)): episode, place in it, time, commands, states."""
     widths = {"episode_index": 1, "frame_index": 1, "timestamp": 1, ACTION: motors, STATE: motors}
-    parts, count = [], 0
-    for path, batch in _batches(sorted((folder / "data").glob("chunk-*/*.parquet")), widths):
-        if (count := count + batch.num_rows) <= frames:
-            parts.append(np.hstack([_numbers(path, batch, name, width) for name, width in widths.items()]))
+    paths = sorted((folder / "data").glob("chunk-*/*.parquet"))
+    count, rows = 0, [np.empty((0, sum(widths.values())))]
+    for path in paths:
+        with _parquet(path) as table:
+            if (count := count + table.metadata.num_rows) <= frames:
+                for batch in table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=[*widths], use_threads=False):
+                    rows.append(np.hstack([_numbers(path, batch, name, width) for name, width in widths.items()]))
     if count != frames:
         text = f"found {count} frames, expected {frames} (meta/info.json)."
         raise DataError(text, where=Location(str(folder / "data")), hint=_WHOLE)
-    return np.vstack(parts)
+    return np.vstack(rows)
+
+
+def _numbers(path: Path, batch: Any, name: str, width: int) -> Array:
+    """A column of numbers, or of lists of numbers (N x width)."""
+    try:
+        values = np.array(batch.column(name).to_pylist(), dtype=float).reshape(batch.num_rows, width)
+    except (KeyError, TypeError, ValueError):  # there is no such column, or no number in it
+        values = np.full((1, 1), np.nan)
+    if not np.isfinite(values).all():
+        text = f"found no column, or a row without finite numbers, expected {width} in each row (meta/info.json)."
+        raise DataError(text, where=Location(str(path), field=name), hint="Leave that episode out.")
+    return values
 
 
 def _require_unit(folder: Path, states: Array, turning: Sequence[bool], stored: Units) -> None:
@@ -168,29 +183,16 @@ def _stretches(rows: Array, scale: Array) -> Iterator[Stretch]:
         yield Stretch(int(part[0, 0]), part[:, 1], part[:, 2], commanded * scale, reached * scale)
 
 
-def _batches(paths: Iterable[Path], columns: Collection[str]) -> Iterator[tuple[Path, Any]]:
-    """Rows of parquet files, some at a time; what the library raises of a damaged one is a DataError with the file."""
+@contextmanager
+def _parquet(path: Path) -> Iterator[Any]:
+    """A parquet file, opened; what the library raises of a damaged one is a DataError with the file."""
     parquet = library("pyarrow.parquet", "reading LeRobot's data sets")
-    for path in paths:
-        try:
-            with parquet.ParquetFile(path, memory_map=True) as table:
-                some = table.iter_batches(batch_size=_ROWS_AT_ONCE, columns=list(columns), use_threads=False)
-                yield from ((path, batch) for batch in some if batch.num_rows)
-        except (OSError, ValueError) as fault:  # pyarrow's own errors derive from these
-            reason = (str(fault) or type(fault).__name__).splitlines()[0][:120]
-            raise DataError(f"it is damaged or cut off ({reason}).", where=Location(str(path)), hint=_WHOLE) from fault
-
-
-def _numbers(path: Path, batch: Any, name: str, width: int) -> Array:
-    """A column of numbers, or of lists of numbers (N x width)."""
     try:
-        values = np.array(batch.column(name).to_pylist(), dtype=float).reshape(batch.num_rows, width)
-    except (KeyError, TypeError, ValueError):  # there is no such column, or no number in it
-        values = np.full((1, 1), np.nan)
-    if not np.isfinite(values).all():
-        text = f"found no column, or a row without finite numbers, expected {width} in each row (meta/info.json)."
-        raise DataError(text, where=Location(str(path), field=name), hint="Leave that episode out.")
-    return values
+        with parquet.ParquetFile(path, memory_map=True) as table:
+            yield table
+    except (OSError, ValueError) as fault:  # pyarrow's own errors derive from these
+        reason = (str(fault) or type(fault).__name__).splitlines()[0][:120]
+        raise DataError(f"it is damaged or cut off ({reason}).", where=Location(str(path)), hint=_WHOLE) from fault
 
 
 def sides(command: Array) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from armcal.report.document import Document, Section, Table
 from scipy.ndimage import binary_dilation
 from scipy.stats import t as student
 
-from armcal_lerobot.motor_file import teeth_of
+from armcal_lerobot.motor_files import teeth_of
 from armcal_lerobot.recordings import REVERSAL, Recording, sides
 
 SETTLED = 3.0  # deg or %: after so much travel from a reversal any play is taken up

@@ -11,9 +11,8 @@ import pytest
 import yaml
 from armcal.errors import ArmcalError, DataError, InputError
 from armcal.plugins import discover
-from armcal_lerobot.arm import Gripper, wiring_of
 from armcal_lerobot.command import lerobot
-from armcal_lerobot.motor_file import Motor
+from armcal_lerobot.motor_files import Gripper, Motor, wiring_of
 from armcal_servobus.joints import drivable
 from click.testing import CliRunner
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 pytest.importorskip("pyarrow")
 from armcal_lerobot.command import lerobot
-from armcal_lerobot.motor_file import read_motors
+from armcal_lerobot.motor_files import read_motors
 from armcal_lerobot.recordings import open_recording, records_of
 
 from tests.plugins.lerobot.planted import FPS, MOTORS, write_dataset, write_motors
