@@ -18,6 +18,7 @@ from armcal.devices.device import (
     DeviceState,
     JointDevice,
     PulseDevice,
+    require_energised,
 )
 from armcal.devices.link import GuardedLink, Link
 from armcal.errors import Location
@@ -172,10 +173,7 @@ class Pca9685Device(JointDevice, PulseDevice):
     @override
     def command(self, angles: Mapping[str, float]) -> None:
         targets = {joint: self._counts_of(joint, angle) for joint, angle in angles.items()}
-        limp = [joint for joint in targets if joint not in self._counts]
-        if limp:
-            text = f"found commands for {', '.join(limp)}, which hang free."
-            raise DeviceRefusedError(text, where=self._where, hint="Energise them first, one at a time.")
+        require_energised(targets, self._counts, self._where)
         if isinstance(self._link, GuardedLink):
             places = {joint: self._servos[joint].place for joint in targets}
             self._link.set_counts({places[joint]: pulse_on(places[joint][1], n) for joint, n in targets.items()})

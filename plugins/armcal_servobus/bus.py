@@ -17,7 +17,7 @@ from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
 from pydantic import Field
 
-from armcal_servobus.models import MAPS, ProtocolName, RegisterMap, ServoModel, Stretch, model_of
+from armcal_servobus.models import MAPS, ProtocolName, RegisterMap, Stretch, model_of
 
 BROADCAST = 0xFE
 LAST_ID = 0xFC
@@ -402,12 +402,12 @@ class FoundServo:
     """A servo that answers, as it was read without writing anything to it."""
 
     id: int
-    number: int  # of its model
-    model: ServoModel | None  # None: its number is not known
+    model_number: int
+    model: str | None  # its name; None: the number is not known
     firmware: str = ""
     position: int | None = None  # as it reports it (counts)
-    voltage: float | None = None  # V
-    temperature: int | None = None  # deg C
+    voltage_V: float | None = None
+    temperature_C: int | None = None
     alarms: tuple[str, ...] = ()  # in words
     damaged: int = 0  # so many of its answers were damaged, or followed by another one
 
@@ -457,8 +457,8 @@ def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo | None:
         model_of(bus.settings.protocol, numbers["model"]),
         f"{firmware & 0xFF}.{firmware >> 8}" if bus.settings.protocol == "feetech" else str(firmware),
         position=numbers["position"],
-        voltage=round(numbers["voltage"] * bus.map.registers["voltage"].unit, 3),
-        temperature=numbers["temperature"],
+        voltage_V=round(numbers["voltage"] * bus.map.registers["voltage"].unit, 3),
+        temperature_C=numbers["temperature"],
         alarms=bus.alarms(servo),
         damaged=damaged,
     )

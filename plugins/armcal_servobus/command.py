@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -47,12 +47,7 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
     """
     protocols = (protocol,) if protocol else get_args(ProtocolName)
     spoken, servos = _searched(console, port, protocols, baud, range(last_id + 1))
-    results: list[dict[str, Any]] = []
-    for rate, servo in servos:
-        results.append({"baud": rate, "id": servo.id, "model": servo.model.name if servo.model else None})
-        results[-1] |= {"model_number": servo.number, "firmware": servo.firmware, "position": servo.position}
-        results[-1] |= {"voltage_V": servo.voltage, "temperature_C": servo.temperature}
-        results[-1] |= {"alarms": list(servo.alarms), "doubled": servo.is_doubled}
+    results = [{"baud": rate, **asdict(servo), "doubled": servo.is_doubled} for rate, servo in servos]
     console.result({"port": port, "protocol": spoken, "servos": results})
     rows = []
     for row in results:
@@ -69,11 +64,7 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
 def _searched(
     console: Console, port: str, protocols: Sequence[ProtocolName], bauds: Sequence[int], ids: Sequence[int]
 ) -> tuple[ProtocolName, list[tuple[int, FoundServo]]]:
-    """The first protocol in which servos of known models answer, else in which any do, and they with their baud rates.
-
-    Raises:
-        InputError: none answers.
-    """
+    """The first protocol in which servos of known models answer, else in which any do; they, with their baud rates."""
     rates = [(protocol, baud) for protocol in protocols for baud in bauds or BAUD_RATES[protocol]]
     there: dict[ProtocolName, list[tuple[int, FoundServo]]] = {}
     with console.progress() as show:
@@ -108,11 +99,7 @@ def _on_config(command: Any) -> Any:
 
 @contextmanager
 def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Servos, WiringRecord]]:
-    """The servos of the bench's device, or of its joint stream, and the record of which were checked.
-
-    Raises:
-        ConfigError: neither is a servo bus, or its settings are refused.
-    """
+    """The servos of the bench's device, or of its joint stream, and the record of which were checked."""
     source = load_config(config, overrides)
     bench = source.data.get(_SECTION)
     parts = bench if isinstance(bench, dict) else {}
@@ -147,11 +134,19 @@ def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
     for name, reading in readings.items():
         there, volts = stored[name], reading["voltage"] * servos.bus.map.registers["voltage"].unit
         rows.append(
-            {"joint": name, "id": joints[name].id, "angle_deg": round(math.degrees(servos.angle(name, reading)), 2)}
+            {
+                "joint": name,
+                "id": joints[name].id,
+                "angle_deg": round(math.degrees(servos.angle(name, reading)), 2),
+                "count": reading["position"],
+                "offset": there["offset"],
+                "limits": [there["min"], there["max"]],
+                "voltage_V": round(volts, 2),
+                "temperature_C": reading["temperature"],
+                "torque": bool(reading["torque"]),
+                "alarms": alarms[name],
+            }
         )
-        rows[-1] |= {"count": reading["position"], "offset": there["offset"], "limits": [there["min"], there["max"]]}
-        rows[-1] |= {"voltage_V": round(volts, 2), "temperature_C": reading["temperature"]}
-        rows[-1] |= {"torque": bool(reading["torque"]), "alarms": alarms[name]}
     across = [name for name, joint in joints.items() if joint.crosses_seam]
     named = [{"joint": mistake.joint, "what": mistake.what, "mend": mistake.mend} for mistake in mistakes]
     console.result({"joints": rows, "mistakes": named, "ranges_over_the_seam": across})
@@ -200,10 +195,6 @@ def planned(
         angles: where joints stand (rad).
         zeros: by how much joints stand beyond what they report (rad).
         offsets: the offsets themselves (counts).
-
-    Raises:
-        InputError: a servo holds no offset as large as needed, or is not let go; what to do is said.
-        DeviceError: a servo does not answer well.
     """
     readings, bus = servos.readings(), servos.bus
     if holding := [name for name, reading in readings.items() if reading["torque"]]:
@@ -227,11 +218,7 @@ def planned(
 
 
 def write_offset(bus: Bus, plan: Homing) -> None:
-    """Write a homing offset to a servo's EEPROM, and read it back.
-
-    Raises:
-        DeviceError: it holds another value afterwards, or does not report what it should.
-    """
+    """Write a homing offset to a servo's EEPROM, and read it back."""
     servo, target = plan.joint.id, (plan.position + plan.moved) % COUNTS
     written = [("offset", plan.after)]
     if bus.settings.protocol == "feetech":
@@ -291,7 +278,11 @@ def home(
         for name in reversed(servos.joints) if release else ():
             servos.release(name)
         plans = planned(servos, {name: math.radians(angle) for name, angle in degrees.items()}, zeros, counts)
-        _show_plans(console, config, plans)
+        rows = ((p.joint.name, p.joint.id, p.position, p.before, p.after, f"{p.change_deg:+.2f}") for p in plans)
+        console.table(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"), rows)
+        back = " ".join(f"--offset {plan.joint.name}={plan.before}" for plan in plans)
+        # kept nowhere else: said in any case
+        click.echo(f"To take them back: armcal bus home {config} {back}", err=True)
         if not yes and not sys.stdin.isatty():
             raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
         if not yes and not click.confirm("Write these offsets to the servos?", err=True):
@@ -304,13 +295,6 @@ def home(
     console.line("the offsets are written and read back.")
     if calibration is not None:
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
-
-
-def _show_plans(console: Console, config: Path, plans: Sequence[Homing]) -> None:
-    rows = ((p.joint.name, p.joint.id, p.position, p.before, p.after, f"{p.change_deg:+.2f}") for p in plans)
-    console.table(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"), rows)
-    back = " ".join(f"--offset {plan.joint.name}={plan.before}" for plan in plans)
-    click.echo(f"To take them back: armcal bus home {config} {back}", err=True)  # kept nowhere else: said in any case
 
 
 def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping[str, ServoJoint]) -> dict[str, float]:

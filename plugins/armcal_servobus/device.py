@@ -20,6 +20,7 @@ from armcal.devices.device import (
     DeviceUnwellError,
     JointDevice,
     MeasuringDevice,
+    require_energised,
 )
 from armcal.devices.link import Link
 from armcal.devices.live import JointSample, JointStream
@@ -147,10 +148,7 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     def command(self, angles: Mapping[str, float]) -> None:
         servos = self._opened()
         goals = {joint: self._joints[joint].count(angle) for joint, angle in angles.items()}
-        limp = [joint for joint in goals if joint not in self._powered]
-        if limp:
-            text = f"found commands for {', '.join(limp)}, which hang free."
-            raise DeviceRefusedError(text, where=self._bus.where, hint="Energise them first, one at a time.")
+        require_energised(goals, self._powered, self._bus.where)
         servos.command(goals)
 
     @override

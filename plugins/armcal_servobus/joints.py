@@ -74,11 +74,7 @@ class ServoJointsSettings(BusSettings):
         return self
 
     def chosen(self, names: Iterable[str]) -> dict[str, ServoJoint]:
-        """The servos of joints or channels, by the name that is asked for.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """The servos of joints or channels, by the name that is asked for."""
         chosen: dict[str, ServoJoint] = {}
         missing = []
         for name in names:
@@ -144,11 +140,7 @@ class ServoJoint:
         return count + COUNTS * round((sum(self.count_range) / 2 - count) / COUNTS)
 
     def count(self, angle: float) -> int:
-        """Nearest to an angle (rad).
-
-        Raises:
-            DeviceRefusedError: it is outside the joint's range.
-        """
+        """Nearest to an angle (rad)."""
         low, high = self.settings.range
         if not low - STEP <= angle <= high + STEP:  # no range has what is not finite
             ends = " to ".join(f"{math.degrees(end):g}" for end in (low, high))
@@ -233,11 +225,7 @@ class Servos:
         return adapter
 
     def examine(self) -> list[Mistake]:
-        """Read what the servos store; gives all that is not as configured.
-
-        Raises:
-            DeviceLostError: no servo answers at all.
-        """
+        """Read what the servos store; gives all that is not as configured."""
         bus, joints = self.bus, self.joints
         servos = {name: looked_at(bus, joint.id, _READ_TWICE) for name, joint in joints.items()}
         ids = {joint.id for joint in joints.values()}
@@ -255,8 +243,8 @@ class Servos:
                 what = f"answers damaged or twice ({servo.damaged} times)"
                 mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
                 mistakes.append(Mistake(joint.label, what, mend))
-            elif model.number not in (servo.number, None):
-                other = servo.model.name if servo.model else f"a model of number {servo.number}"
+            elif model.number not in (servo.model_number, None):
+                other = servo.model or f"a model of number {servo.model_number}"
                 mend = f"Set model, or plug in the {model.name}; ids may be exchanged."
                 mistakes.append(Mistake(joint.label, f"is {other}, expected {model.name}", mend))
             else:
@@ -265,11 +253,7 @@ class Servos:
         return mistakes
 
     def readings(self) -> dict[str, dict[str, int]]:
-        """What changes while servos work, by joint and register, as it stands there.
-
-        Raises:
-            DeviceError: one does not answer, or not well.
-        """
+        """What changes while servos work, by joint and register, as it stands there."""
         by_id = self.bus.numbers([joint.id for joint in self.joints.values()], *self.bus.map.polled)
         return dict(zip(self.joints, by_id.values(), strict=True))
 
@@ -296,11 +280,7 @@ class Servos:
         self._goals[name] = count
 
     def release(self, name: str) -> None:
-        """Torque off, read back.
-
-        Raises:
-            DeviceError: it is still on.
-        """
+        """Torque off, read back."""
         self._goals.pop(name, None)
         joint = self.joints[name]
         self.bus.set_number(joint.id, "torque", 0)
@@ -315,11 +295,7 @@ class Servos:
         self.bus.write_all(self.bus.map.registers["goal"].address, written)
 
     def repeat(self, readings: Mapping[str, Mapping[str, int]], powered: Collection[str]) -> None:
-        """Command once more what did not arrive: a goal for all at once is acknowledged by nobody.
-
-        Raises:
-            DeviceError: a servo does not take its goal.
-        """
+        """Command once more what did not arrive: a goal for all at once is acknowledged by nobody."""
         for name, goal in self._goals.items():
             if name in powered and readings[name]["goal"] != goal:
                 address = self.bus.map.registers["goal"].address

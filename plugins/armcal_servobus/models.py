@@ -24,11 +24,7 @@ class Register:
     unit: float = 1.0  # what one count is, in SI
 
     def pack(self, value: int) -> bytes:
-        """As it is written.
-
-        Raises:
-            ValueError: it does not fit.
-        """
+        """As it is written."""
         bits = self.sign_bit if self.sign_bit is not None else 8 * self.size - self.is_signed
         most = (1 << bits) - 1
         least = -most if self.sign_bit is not None else -(most + 1) if self.is_signed else 0
@@ -148,6 +144,6 @@ BAUD_RATES: Mapping[ProtocolName, tuple[int, ...]] = MappingProxyType(
 """Those that servos can be set to, the likeliest first."""
 
 
-def model_of(protocol: ProtocolName, number: int) -> ServoModel | None:
-    """The model with a number; None: not known."""
-    return next((model for model in _ALL if model.protocol == protocol and model.number == number), None)
+def model_of(protocol: ProtocolName, number: int) -> str | None:
+    """The name of the model with a number; None: not known."""
+    return next((model.name for model in _ALL if model.protocol == protocol and model.number == number), None)

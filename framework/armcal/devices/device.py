@@ -1,12 +1,12 @@
 """What moves the joints of a bench, and what goes wrong with it."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Protocol, runtime_checkable
 
 from armcal.devices.clock import Clock
-from armcal.errors import ArmcalError, InputError
+from armcal.errors import ArmcalError, InputError, Location
 from armcal.plugins import expecting, refuse
 
 
@@ -165,6 +165,13 @@ def measured_angles(device: JointDevice) -> dict[str, float]:
     measured = device.measured()
     _check_angles(device.measured, measured, device.joint_names, whole=True)
     return measured
+
+
+def require_energised(joints: Iterable[str], energised: Container[str], where: Location | None = None) -> None:
+    """Raise DeviceRefusedError if joints are to move that hang free: to be called by ``command`` of a device."""
+    if limp := [joint for joint in joints if joint not in energised]:
+        text = f"found commands for {', '.join(limp)}, which hang free."
+        raise DeviceRefusedError(text, where=where, hint="Energise them first, one at a time.")
 
 
 def _check_angles(method: Callable[..., Any], angles: Any, joints: Collection[str], *, whole: bool = False) -> None:

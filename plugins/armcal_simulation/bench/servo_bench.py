@@ -18,13 +18,13 @@ from armcal.devices.device import (
     DeviceError,
     DeviceIdentity,
     DeviceLostError,
-    DeviceRefusedError,
     DeviceResetError,
     DeviceState,
     DeviceUnwellError,
     JointDevice,
     MeasuringDevice,
     PulseDevice,
+    require_energised,
 )
 from armcal.devices.live import JointSample, JointStream, Tracker, TrackerFrame
 from armcal.devices.simulated import ACCOUNT, LOG, BenchRequest, RunningBench, SimulatedBench
@@ -329,11 +329,7 @@ class RunningServoBench(BenchWorld, RunningBench):
                 yield False
 
     def _before(self) -> dict[str, Any]:
-        """The state that is there; empty if none is.
-
-        Raises:
-            InputError: it is no bench's.
-        """
+        """The state that is there; empty if none is."""
         try:
             before: dict[str, Any] = json.loads(self._account.read_bytes())
             _ = before["now"] + before["board"]["boots"]
@@ -421,9 +417,7 @@ class SimulatedDevice(JointDevice):
     @override
     def command(self, angles: Mapping[str, float]) -> None:
         self._reach()
-        if limp := [joint for joint in angles if joint not in self._bench.positions]:
-            text = f"found commands for {', '.join(limp)}, which hang free."
-            raise DeviceRefusedError(text, hint="Energise them first, one at a time.")
+        require_energised(angles, self._bench.positions)
         self._write({joint: self._position(joint, angle) for joint, angle in angles.items()})
 
     @override

@@ -128,10 +128,10 @@ def test_all_servos_are_found():
         bus = opened(fake)
         fake.servos[1].alarm = 0x20
         found_servos = servos_on(bus)
-        assert [(s.id, s.model and s.model.name, s.firmware, s.position) for s in found_servos] == [
+        assert [(s.id, s.model, s.firmware, s.position) for s in found_servos] == [
             (1, "sts3215", "3.10", 10), (3, "sts3215", "3.10", 30), (250, "sts3215", "3.10", 40)
         ]  # fmt: skip
-        assert found_servos[1].alarms == ("overload",) and found_servos[0].voltage == 12.1
+        assert found_servos[1].alarms == ("overload",) and found_servos[0].voltage_V == 12.1
         assert not any(s.is_doubled for s in found_servos)
         bus.close()
 
