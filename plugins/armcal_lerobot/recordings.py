@@ -53,10 +53,6 @@ class Recording:
     stretches: tuple[Stretch, ...]  # in order
 
     @property
-    def frames(self) -> int:
-        return sum(len(stretch.frame) for stretch in self.stretches)
-
-    @property
     def motion(self) -> tuple[Stretch, ...]:
         """All stretches of ten frames and more."""
         stretches = tuple(stretch for stretch in self.stretches if len(stretch.frame) >= _FEWEST)
@@ -88,10 +84,6 @@ def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | No
     """A data set whose numbers are in a unit (the gripper's always in percent).
 
     With the follower's calibration file percent become degrees.
-
-    Raises:
-        DataError: a file is damaged or cut off, frames are missing, or the numbers have another unit.
-        InputError: the calibration lacks a motor.
     """
     path = folder / "meta" / "info.json"
     where = Location(str(path))

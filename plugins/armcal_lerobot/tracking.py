@@ -233,7 +233,7 @@ def compared(recording: Recording) -> Document:
     followed = trackings(recording)
     content: dict[str, Any] = {
         "data": str(recording.folder),
-        "frames": recording.frames,
+        "frames": sum(len(stretch.frame) for stretch in recording.stretches),
         "motors": {t.motor: asdict(t) for t in followed},
         "findings": findings_of(followed),
         "cannot_show": LIMITS_OF_DATA,

@@ -22,7 +22,6 @@ _SLACK = 1e-9
 _READ_TWICE = 2
 _ROUNDED = 2  # Counts: limits in a servo may be so much narrower than a range that was rounded
 _FASTEST = 32767  # As the registers have it, in which zero is no limit
-AngleRange = Annotated[tuple[float, float], UnitOf("angle")]
 
 
 class BusJointSettings(Settings):
@@ -36,7 +35,7 @@ class BusJointSettings(Settings):
     model: str
     zero_count: int = COUNTS // 2
     direction: Literal[1, -1] = 1
-    range: AngleRange
+    range: Annotated[tuple[float, float], UnitOf("angle")]
     offset: int | None = None
 
     @field_validator("model")
