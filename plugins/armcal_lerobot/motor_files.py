@@ -40,6 +40,8 @@ _FARTHEST_DEG = 300.0  # No joint of an arm that LeRobot drives by these servos 
 _LONGER_DEG, _SAME_DEG, _NARROW_DEG = 60.0, 6.0, 40.0
 Units = Literal["degrees", "percent"]
 LAST_COUNT = 4095
+_LAST_OF_SMALL, _WHOLE_DEG = 1023, 360
+"""Of Feetech SCS servos, and of files in degrees: LeRobot homes an STS servo about the middle of its 4096 counts."""
 COUNTS_A_TURN = 4096
 LARGEST_OFFSET = 2047
 DEGREES_A_COUNT = 360 / LAST_COUNT  # As LeRobot has it; a count of the encoder itself is 360 / 4096 deg
@@ -181,6 +183,7 @@ def read_motors(path: Path) -> MotorFile:
     content, entries = read_json(path, _MAX_BYTES, "a LeRobot calibration file (JSON)", hint)
     if not isinstance(entries, dict) or not entries:
         _refuse(path, "", f"found {json.dumps(entries)[:40]}, expected a key a motor.", hint)
+    _require_counts(path, [entry for entry in entries.values() if isinstance(entry, dict)])
     motors = {name: _motor(path, name, entry) for name, entry in entries.items()}
     owners: dict[int, str] = {}
     for name, motor in motors.items():
@@ -208,6 +211,21 @@ def read_json(path: Path, most: int, expected: str, hint: str) -> tuple[bytes, A
     except (ValueError, RecursionError) as fault:
         where = Location(str(path), line=getattr(fault, "lineno", None))
         raise DataError(f"it is not JSON ({getattr(fault, 'msg', fault)}).", where=where, hint=hint) from fault
+
+
+def _require_counts(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse ranges that are degrees, or counts of a smaller turn; what is no number is for ``_motor`` to name."""
+    ends: list[Any] = [entry.get(field) for entry in entries for field in ("range_min", "range_max")]
+    offsets: list[Any] = [entry.get("homing_offset") for entry in entries]
+    if not ends or any(type(value) is not int for value in (*ends, *offsets)):
+        return
+    low, high, is_homed = min(ends), max(ends), any(offsets)
+    kind = "counts of a turn of 1,024" if low >= 0 and high <= _LAST_OF_SMALL and not is_homed else ""
+    if low >= -_WHOLE_DEG and high <= _WHOLE_DEG and (low < 0 or not is_homed):
+        kind = "degrees"
+    if kind:
+        text = f"found ranges of {low} to {high}, expected counts of 0 to {LAST_COUNT}: these are {kind}, of an arm"
+        _refuse(path, "", f"{text} without Feetech STS servos.", _READS)
 
 
 def _motor(path: Path, name: str, entry: Any) -> Motor:

@@ -53,6 +53,7 @@ OTHERS = [
     {"shoulder_pan": {"range_min": 0, "range_max": 4095, "homing_offset": 3072}},
     {"elbow_flex": {"range_min": -700, "range_max": 4000}},
     {"joint1": DEGREES, "gripper": {**DEGREES, "range_min": 0, "range_max": 270}},
+    {"finger": {"homing_offset": 0, "range_min": 80, "range_max": 1020}, "thumb": {**DEGREES, "range_min": 0}},
 ]
 
 
@@ -60,8 +61,10 @@ OTHERS = [
 def test_files_of_other_motors_are_refused_with_those_that_are_read(tmp_path: Path, motors: dict) -> None:
     path, whole = tmp_path / "arm.json", {"drive_mode": 0, "homing_offset": 5}
     path.write_text(json.dumps({name: {"id": i, **whole, **entry} for i, (name, entry) in enumerate(motors.items())}))
-    with pytest.raises(DataError, match=r"files of Feetech STS servos .* and none of Dynamixel"):
+    with pytest.raises(DataError, match=r"files of Feetech STS servos .* and none of Dynamixel") as refused:
         read_motors(path)
+    if all(entry.get("homing_offset") == 0 for entry in motors.values()):  # by what all of it holds
+        assert "without Feetech STS servos" in str(refused.value) and "calibrate again" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
