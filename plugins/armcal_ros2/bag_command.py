@@ -1,13 +1,120 @@
-"""``armcal bag``: what a recording holds, and images taken out of it."""
+"""``armcal bag``: what a recording holds, the data section that would read it, and images taken out of it."""
 
+from bisect import bisect_right
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import click
+import numpy as np
 import yaml
 from armcal.cli.common import FILE, Console, speaking
+from armcal.errors import DataError
+from armcal.io.plain_files import refuse, require_new, write_new
+from numpy.typing import NDArray
 
-from armcal_ros2.bag import IMAGES, Bag
+from armcal_ros2.bag import CAMERA_INFO, IMAGES, JOINT_STATE, Bag, Stamps, nanoseconds
+from armcal_ros2.reader import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
+
+_MOST_FRAMES = 200
+_LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once
+
+
+@dataclass
+class TopicSummary:
+    """A topic: its type, messages, and frames (of transforms ``a -> b``).
+
+    ``first`` and ``last`` are when its messages were received (s since 1970), of topics that calibrate.
+    ``computed`` counts transforms, by frame, with the very stamp of a joint state: robot_state_publisher's.
+    """
+
+    type: str
+    first: float | None = None
+    last: float | None = None
+    count: int = 0
+    frames: Counter[str] = field(default_factory=Counter)
+    computed: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def measured(self) -> list[str]:
+        return [frame for frame, count in self.frames.items() if 2 * self.computed[frame] < count]
+
+
+class Survey(NamedTuple):
+    """Topics by name, joint states by topic, and what is missing or wrong."""
+
+    topics: dict[str, TopicSummary]
+    joints: dict[str, JointLog]
+    remarks: list[str]
+
+
+def survey(bag: Bag) -> Survey:
+    """Once through the recording.
+
+    Raises:
+        DataError: it is none, or holds no message.
+        PluginError: rosbags is not there.
+    """
+    topics, joints, remarks = dict[str, TopicSummary](), dict[str, JointLog](), list[str]()
+    stamps = deque[int](maxlen=_LATEST)
+    for topic, received, _, message in bag.messages(lambda topic: topic.type in (JOINT_STATE, *MEASURED)):
+        time = received / 1e9
+        own = topics.setdefault(topic.name, TopicSummary(topic.type, time))
+        own.last, own.first = max(own.last or time, time), min(own.first or time, time)
+        if topic.type == JOINT_STATE and not message.name:
+            continue
+        if topic.type == JOINT_STATE:
+            if topic.name not in joints:
+                own_settings, slides = JointsSettings(topic=topic.name), [False] * len(message.name)
+                joints[topic.name] = JointLog(message.name, slides, own_settings, RestSettings())
+            joints[topic.name].add(topic, message, received)
+            stamps.append(nanoseconds(message.header.stamp) or -1)
+            continue
+        for part in message.transforms if topic.type == TRANSFORMS else [message]:
+            child = getattr(part, "child_frame_id", "")
+            frame = f"{part.header.frame_id} -> {child}" if child else part.header.frame_id
+            if frame in own.frames or len(own.frames) < _MOST_FRAMES:
+                own.frames[frame] += 1
+                own.computed[frame] += int(bool(child) and nanoseconds(part.header.stamp) in stamps)
+    for topic, count in bag.topics.items():
+        topics.setdefault(topic.name, TopicSummary(topic.type)).count += count
+    if not any(own.count for own in topics.values()):
+        refuse(
+            bag.path, "found no message in it.", " ".join([*bag.remarks, "Record again, or give another recording."])
+        )
+    for log in joints.values():
+        try:
+            remarks += log.close(str(bag.path))
+        except DataError as fault:
+            remarks.append(f"{fault.message} {fault.hint}")
+    for name, summary in topics.items():
+        if summary.computed.total() and not summary.measured:
+            remarks.append(f"all frames in {name} are computed from the joints: they measure nothing.")
+    return Survey(topics, joints, [*bag.remarks, *remarks])
+
+
+def _data_section(path: Path, found: Survey) -> dict[str, Any]:
+    """One that would read it; empty without joint states."""
+    if not found.joints:
+        return {}
+    topic, log = max(found.joints.items(), key=lambda entry: len(entry[1].rests))
+    section: dict[str, Any] = {"type": "rosbag2", "path": str(path), "joints": {"topic": topic}}
+    numbered = {f"q{i}": name for i, name in enumerate(log.names, start=1)}
+    if set(numbered) != set(log.names):
+        section["joints"]["names"] = numbered
+    measured: dict[str, dict[str, str]] = {}
+    for name, summary in found.topics.items():
+        if summary.type not in MEASURED or name.endswith("_static") or not summary.measured:
+            continue
+        instance = f"tracker{len(measured) + 1}" if measured else "tracker"
+        measured[instance] = {"topic": name}
+        if summary.type == TRANSFORMS:
+            parent, _, child = summary.measured[-1].partition(" -> ")
+            measured[instance] |= {"frame": child, "reference": parent}
+    return {**section, "measurements": measured} if measured else section
 
 
 @click.group()
@@ -20,28 +127,35 @@ def bag() -> None:
 @speaking
 def info(console: Console, path: Path) -> None:
     """Topics, times and rests of the recording PATH, and a data section for a configuration."""
-    from armcal_ros2.survey import survey
-
-    content = survey(Bag(path))
-    data = content.data(path)
-    console.result({**content.content(), "data": data})
-    begin = min((topic.first for topic in content.topics.values() if topic.first is not None), default=0.0)
+    found = survey(Bag(path))
+    topics, joints, remarks = found
+    data = _data_section(path, found)
+    console.result(
+        {
+            "topics": {name: vars(topic) for name, topic in topics.items()},
+            "joints": {name: list(log.names) for name, log in joints.items()},
+            "rests": {name: [[rest.begin, rest.end] for rest in log.rests] for name, log in joints.items()},
+            "remarks": remarks,
+            "data": data,
+        }
+    )
+    begin = min((topic.first for topic in topics.values() if topic.first is not None), default=0.0)
     rows = (
         (name, topic.type, topic.count, *("" if t is None else f"{t - begin:.1f}" for t in (topic.first, topic.last)))
-        for name, topic in content.topics.items()
+        for name, topic in topics.items()
     )
     console.table("Topics", ("topic", "type", "messages", "from s", "to s"), rows, left=("type",))
-    for name, log in content.joints.items():
+    for name, log in joints.items():
         lengths = [rest.end - rest.begin for rest in log.rests]
         spans = f" of {min(lengths):.1f} to {max(lengths):.1f} s" if lengths else ""
         console.line(f"{name}: {len(lengths)} rests{spans}; joints {', '.join(log.names)}.")
-    for remark in content.remarks:
+    for remark in remarks:
         console.warn(remark)
-    pictures = [name for name, topic in content.topics.items() if topic.type in IMAGES]
     if data.get("measurements"):
         _show_data(console, data, "names" in data["joints"])
-    for name in pictures if data else ():
-        console.line(f"Images of its rests: armcal bag images {path} --topic {name} --out FOLDER")
+    for name, topic in topics.items() if data else ():
+        if topic.type in IMAGES:
+            console.line(f"Images of its rests: armcal bag images {path} --topic {name} --out FOLDER")
 
 
 @bag.command()
@@ -55,19 +169,41 @@ def images(
     console: Console, path: Path, out: Path, topic: str | None, joints: str | None, clock_offset_ms: float
 ) -> None:
     """Take one image of each rest out of the recording PATH, for the reader images."""
-    from armcal_ros2.survey import extract
-
-    extracted = extract(Bag(path), out, topic, joints, clock_offset_ms / 1000)
-    data: dict[str, Any] = {"type": "images", "folder": str(out), "poses": str(out / "joints.csv")}
-    console.result({"images": list(extracted.images), "files": [str(file) for file in extracted.files], "data": data})
-    console.line(f"{len(extracted.images)} images written: {out}")
-    for remark in extracted.remarks:
+    recording = Bag(path)
+    found = survey(recording)
+    seen = _only(path, [name for name, own in found.topics.items() if own.type in IMAGES], topic, "images", "--topic")
+    log = found.joints[_only(path, list(found.joints), joints, "joint states", "--joints")]
+    rests = [rest for rest in log.rests if rest.end - rest.begin >= RestSettings().window]
+    table, information = out / "joints.csv", out / "camera_info.yaml"
+    require_new([table, information])
+    out.mkdir(parents=True, exist_ok=True)
+    stamps, written, infos = Stamps(seen, "header"), dict[int, str](), list[Any]()
+    for place, message in _nearest(recording, seen, rests, stamps, clock_offset_ms / 1000, infos):
+        suffix, picture = picture_of(message, seen)
+        written[place] = f"rest{place + 1:04d}{suffix}"
+        write_new({out / written[place]: picture})
+    remarks = [*found.remarks, *stamps.check(str(path))]
+    if not written:
+        refuse(path, f"found no image of {seen} in {len(rests)} rests.", " ".join(remarks) or "Record again.")
+    if len(written) < len(rests):
+        remarks.append(f"{len(rests) - len(written)} of {len(rests)} rests have no image.")
+    lines = [",".join(["image", "time_s", *(f"{name}_rad" for name in log.names)])]
+    for place, name in written.items():
+        middle = (rests[place].begin + rests[place].end) / 2
+        lines.append(",".join([name, *map(repr, [middle, *rests[place].means.tolist()])]))
+    files = {table: ("\n".join(lines) + "\n").encode()}
+    if infos:
+        files[information] = _camera_info(infos[0]).encode()
+    write_new(files)
+    names = {f"q{i}_rad": f"{name}_rad" for i, name in enumerate(log.names, start=1)}
+    is_named = not {f"{name}_rad" for name in log.names} <= names.keys()
+    poses = {"type": "csv", "path": str(table), "columns": names} if is_named else str(table)
+    data = {"type": "images", "folder": str(out), "poses": poses}
+    console.result({"images": [*written.values()], "files": [str(file) for file in files], "data": data})
+    console.line(f"{len(written)} images written: {out}")
+    for remark in remarks:
         console.warn(remark)
-    named = not set(extracted.joints) <= {f"q{i}" for i in range(1, len(extracted.joints) + 1)}
-    if named:
-        names = {f"q{i}_rad": f"{name}_rad" for i, name in enumerate(extracted.joints, start=1)}
-        data["poses"] = {"type": "csv", "path": str(out / "joints.csv"), "columns": names}
-    _show_data(console, data, named)
+    _show_data(console, data, is_named)
 
 
 def _show_data(console: Console, data: dict[str, Any], named: bool) -> None:
@@ -75,3 +211,100 @@ def _show_data(console: Console, data: dict[str, Any], named: bool) -> None:
     console.out.print(yaml.safe_dump({"data": data}, sort_keys=False, default_flow_style=None), soft_wrap=True)
     if named:
         console.line("# Leave q1, q2, ... out where the arm's joints are called as in the recording, as in a URDF.")
+
+
+def _only(path: Path, names: Sequence[str], stated: str | None, what: str, option: str) -> str:
+    chosen = names[0] if stated is None and len(names) == 1 else stated
+    if chosen is None or chosen not in names:
+        text = f"found topics with {what}: {', '.join(names) or 'none'}, expected {stated or 'one'}."
+        refuse(path, text, f"Give {option} NAME." if names else "Record them too.")
+    return chosen
+
+
+def _nearest(
+    bag: Bag, topic: str, rests: Sequence[JointRest], stamps: Stamps, offset: float, infos: list[Any]
+) -> Iterator[tuple[int, Any]]:
+    """The place of each rest with an image, and the image nearest to its middle; only one is held at a time."""
+    begins, settle = [rest.begin for rest in rests], RestSettings().settle
+    above = topic.removesuffix("/compressed").rpartition("/")[0]
+    held: tuple[int, float, Any] | None = None
+    for own, received, _, message in bag.messages(lambda read: read.name in (topic, f"{above}/camera_info")):
+        if own.type == CAMERA_INFO:
+            infos.append(message)
+            continue
+        time = stamps.time(nanoseconds(message.header.stamp), received)
+        place = -1 if time is None else bisect_right(begins, time - offset) - 1
+        if time is None or place < 0 or not begins[place] + settle <= time - offset <= rests[place].end - GUARD_S:
+            continue
+        away = abs(time - offset - (rests[place].begin + rests[place].end) / 2)
+        if held is not None and held[0] != place:
+            yield held[0], held[2]
+            held = None
+        if held is None or away < held[1]:
+            held = (place, away, message)
+    if held is not None:
+        yield held[0], held[2]
+
+
+_LUMA = np.array([0.299, 0.587, 0.114])
+_MAGIC: Mapping[bytes, str] = MappingProxyType({b"\xff\xd8": ".jpg", b"\x89PNG": ".png"})
+_STEPS: Mapping[str, tuple[int, tuple[int, ...]]] = MappingProxyType(
+    {
+        "mono8": (1, (0,)),
+        "8uc1": (1, (0,)),
+        "rgb8": (3, (0, 1, 2)),
+        "bgr8": (3, (2, 1, 0)),
+        "8uc3": (3, (2, 1, 0)),
+        "rgba8": (4, (0, 1, 2)),
+        "bgra8": (4, (2, 1, 0)),
+        "yuv422_yuy2": (2, (0,)),
+        "yuyv": (2, (0,)),
+        "yuv422": (2, (1,)),
+        "uyvy": (2, (1,)),
+    }
+)
+"""Bytes of a pixel by encoding, and which of them are red, green and blue, or the brightness."""
+
+
+def picture_of(message: Any, topic: str) -> tuple[str, bytes]:
+    """The ending of a file's name and its content: as compressed, or grey values as PGM.
+
+    Raises:
+        DataError: of an encoding that is not read.
+    """
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not hasattr(message, "encoding"):
+        content = data.tobytes()
+        suffix = next((ending for magic, ending in _MAGIC.items() if content.startswith(magic)), None)
+        if suffix is None:
+            refuse(topic, f"found images compressed as {message.format!r}, expected JPEG or PNG.", "Record others.")
+        return suffix, content
+    rows = data.reshape(message.height, message.step)
+    encoding = message.encoding.lower()
+    if encoding in ("mono16", "16uc1"):
+        pixels = rows[:, : 2 * message.width].reshape(message.height, message.width, 2)
+        return ".pgm", _pgm(pixels[:, :, 0 if message.is_bigendian else 1])
+    if encoding not in _STEPS:
+        known = ", ".join(_STEPS)
+        refuse(topic, f"found images encoded as {message.encoding!r}, expected {known} or mono16.", "Record others.")
+    step, places = _STEPS[encoding]
+    pixels = rows[:, : step * message.width].reshape(message.height, message.width, step)[:, :, list(places)]
+    grey = pixels[:, :, 0] if len(places) == 1 else np.round(pixels @ _LUMA)
+    return ".pgm", _pgm(grey.astype(np.uint8))
+
+
+def _pgm(grey: NDArray[np.uint8]) -> bytes:
+    height, width = grey.shape
+    return f"P5\n{width} {height}\n255\n".encode() + np.ascontiguousarray(grey).tobytes()
+
+
+def _camera_info(message: Any) -> str:
+    distortion = [float(x) for x in message.d]
+    content = {
+        "image_width": int(message.width),
+        "image_height": int(message.height),
+        "camera_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in message.k]},
+        "distortion_model": message.distortion_model,
+        "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
+    }
+    return yaml.safe_dump(content, sort_keys=False)

@@ -1,63 +1,418 @@
 """The reader ``rosbag2``: records from a recording of ROS 2, one a rest of the arm."""
 
+from __future__ import annotations
+
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, NoReturn
+import math
+from array import array
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal, NoReturn
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.settings import InputPath, Settings
+from armcal.base.settings import Angle, Duration, InputPath, Length, Settings
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
-from armcal.measure.rests import deviations_of_mean, judged, mean_pose
-from pydantic import Field
+from armcal.measure.rests import StillSettings, deviations_of_mean, judged, mean_pose, rests
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from armcal_ros2.bag import JOINT_STATE, Bag, Topic
-from armcal_ros2.samples import (
-    GUARD_S,
-    MEASURED,
-    TRANSFORMS,
-    JointLog,
-    JointRest,
-    JointsSettings,
-    MeasuredLog,
-    MeasuredSettings,
-    RestSettings,
-    channels_of,
+from armcal_ros2.bag import JOINT_STATE, Bag, Stamps, Topic, TopicSettings, nanoseconds
+
+GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
+_THINNED_S = 0.01  # Joints are kept so far apart: 25 MB for an hour of seven of them
+_LARGEST = 1e6  # No joint stands so far away, in any unit
+_JUMP, _MOST_RETURNS = 20.0, 0.1
+"""A larger part of messages that jump by so many spreads, to where the joints just were: two programs publish them."""
+
+
+class JointsSettings(TopicSettings):
+    """Where joint angles come from.
+
+    ``names`` maps joints of the arm (``q1``, with several arms ``left.q1``) to those of the recording; others have
+    their own name there. ``unit`` is rad as ROS has it, or deg where the driver errs.
+    """
+
+    names: dict[str, str] = Field(default_factory=dict)
+    unit: Literal["rad", "deg"] = "rad"
+
+
+class RestSettings(Settings):
+    """What a rest is."""
+
+    window: Annotated[Duration, Field(gt=0)] = 0.5  # how long it lasts at least
+    spread: Annotated[Angle, Field(gt=0)] = math.radians(0.1)  # by how much no turning joint moves in it
+    sliding_spread: Annotated[Length, Field(gt=0)] = 0.0002  # and no sliding one
+    settle: Annotated[Duration, Field(ge=0)] = 0.2  # what passes after joints stopped before measurements count
+    drift: Annotated[Length, Field(gt=0)] = 0.001  # by how much means of the measured positions in its halves differ
+
+
+@dataclass(frozen=True)
+class JointRest:
+    """A rest of the joints: begin and end (s), means and standard deviations by joint (rad or m)."""
+
+    begin: float
+    end: float
+    means: Array
+    scatter: Array
+
+
+class JointLog:
+    """Joint states as they come: rests, and directions of motion.
+
+    ``names`` are those of the recording, and ``slides`` says which of these joints slide. ``rests`` are complete once
+    it is closed: also shorter ones than a rest's window, to be listed.
+    """
+
+    def __init__(
+        self, names: Sequence[str], slides: Sequence[bool], settings: JointsSettings, still: RestSettings
+    ) -> None:
+        self.names = tuple(names)
+        self._limits = np.where(slides, still.sliding_spread, still.spread)
+        self._scale = np.where(slides, 1.0, math.radians(1.0) if settings.unit == "deg" else 1.0)
+        self._still = still
+        self._places: dict[tuple[str, ...], list[int]] = {}
+        self._times, self._rows = array("d"), array("d")
+        self._turned_at: list[tuple[float, Array]] = []
+        self._furthest: Array | None = None
+        self._direction = np.zeros(len(self.names))
+        self._before: list[Array] = []  # where the joints were last, and where before that, apart
+        self._returns = self._faulty = 0
+        self._lacking = Counter[str]()
+        self._others = set[str]()
+        self._stated = settings.topic
+        self.topic = settings.topic  # if none was stated, the first that has joint states
+        self.stamps = Stamps(settings.topic or "", settings.stamps)
+        self.largest = np.zeros(len(self.names))  # absolute positions, by joint (rad or m), once it is closed
+        self.rests: list[JointRest] = []
+
+    def reads(self, topic: Topic) -> bool:
+        return topic.type == JOINT_STATE and self._stated in (None, topic.name)
+
+    def add(self, topic: Topic, message: Any, received: int) -> None:
+        """The next message, a sensor_msgs/JointState."""
+        if self.topic is None:
+            self.topic = self.stamps.topic = topic.name
+        if topic.name != self.topic:
+            self._others.add(topic.name)
+            return
+        names = tuple(message.name)
+        if names not in self._places:
+            self._places[names] = [names.index(name) for name in self.names if name in names]
+        places = self._places[names]
+        if len(places) < len(self.names):
+            if places:
+                self._lacking[next(name for name in self.names if name not in names)] += 1
+            return
+        time = self.stamps.time(nanoseconds(message.header.stamp), received)
+        if time is None:
+            return
+        if len(message.position) != len(names) or not (np.abs(row := message.position[places]) < _LARGEST).all():
+            self._faulty += 1
+            return
+        self._take(time, row * self._scale)
+
+    def close(self, place: str) -> list[str]:
+        """The end of the recording: what was left out, sentences.
+
+        Raises:
+            DataError: nothing in it can be used.
+        """
+        times, rows = np.array(self._times), np.array(self._rows).reshape(-1, len(self.names)).T
+        self.largest = np.abs(rows).max(axis=1, initial=0.0)
+        still = StillSettings.si(window=self._still.window / 2, spread=1.0)
+        for rest in rests(rows / self._limits[:, None], (), times, still):
+            self.rests.append(self._rest(times[rest.start : rest.stop], rows[:, rest.start : rest.stop]))
+        topic, count, named = self.topic, self.stamps.count, set().union(*self._places)
+        if self._others or topic is None or not (named or count):
+            text = f"found {', '.join(sorted(filter(None, (topic, *self._others)))) or 'no topic'} with joint states"
+            hint = "Set joints: {topic: NAME} in the data section; armcal bag info lists what is there."
+            refuse(place, f"{text}, expected one.", hint)
+        if not count:
+            lacking = [name for name in self.names if name not in named]
+            hint = "Give joints: {names: {JOINT: NAME IN THE RECORDING}} in the data section."
+            missing = f"joint {lacking[0]}" if lacking else "message with all joints of the arm"
+            refuse(place, f"found no {missing} in {topic}; its joints are {', '.join(sorted(named)) or 'none'}.", hint)
+        remarks = self.stamps.check(place)
+        if self._faulty == count:
+            hint = "Repair the driver, or record again."
+            refuse(place, f"none of {count} messages of {topic} has a finite position for each joint.", hint)
+        if self._returns > _MOST_RETURNS * count:
+            text = f"the joints of {topic} jump to and fro between two sets of values in {self._returns} of {count}"
+            hint = "Stop one of them, such as joint_state_publisher beside a controller, and record again."
+            refuse(place, f"{text} messages: two programs publish it.", hint)
+        if self._lacking:
+            (name, some), *_ = self._lacking.most_common()
+            remarks.append(f"{some} messages of {topic} name some joints of the arm without {name}: left out.")
+        if self._faulty:
+            text = f"{self._faulty} of {count} messages of {topic} have positions that are missing or not finite"
+            remarks.append(f"{text}: left out.")
+        pauses = np.diff(times)
+        if (silent := pauses > self._still.window).any():
+            longest = int(np.argmax(pauses))
+            text = f"{topic} is silent {silent.sum()} times, for up to {pauses[longest]:.1f} s"
+            remarks.append(f"{text} (from {times[longest]:.2f}): a rest ends there.")
+        return remarks
+
+    def approach(self, time: float) -> Array:
+        """The sign of each joint's last motion before a time; 0 where it has not moved."""
+        place = bisect_right(self._turned_at, time, key=lambda entry: entry[0])
+        return self._turned_at[place - 1][1] if place else np.zeros(len(self.names))
+
+    def _take(self, time: float, row: Array) -> None:
+        if self._before and (np.abs(row - self._before[0]) > _JUMP * self._limits).any():
+            self._returns += int((np.abs(row - self._before[-1]) <= self._limits).all())
+            self._before.insert(1, self._before[0])
+        self._before[:] = [row, *self._before[1:2]]
+        if not self._times or time - self._times[-1] >= _THINNED_S:
+            self._times.append(time)
+            self._rows.extend(row.tolist())
+        if self._furthest is None:
+            self._furthest = row
+        moved = row - self._furthest
+        beyond = np.abs(moved) > self._limits
+        if beyond.any():
+            self._furthest = np.where(beyond, row, self._furthest)
+            direction = np.where(beyond, np.sign(moved), self._direction)
+            if (direction != self._direction).any():
+                self._turned_at.append((time, direction))
+                self._direction = direction
+
+    def _rest(self, times: Array, rows: Array) -> JointRest:
+        begin, end = float(times[0]), float(times[-1])
+        settled = (times >= begin + self._still.settle) & (times <= end - GUARD_S)
+        joints = rows[:, settled] if settled.any() else rows
+        return JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1))
+
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_FIELDS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+    {
+        "geometry_msgs/msg/PoseStamped": ("pose", "position", "orientation"),
+        "geometry_msgs/msg/PointStamped": ("", "point", ""),
+        "geometry_msgs/msg/TransformStamped": ("transform", "translation", "rotation"),
+    }
 )
+MEASURED = (*_FIELDS, TRANSFORMS)  # The types of messages that measure
+_NORM_TOLERANCE = 1e-3
+_STATIC = "/tf_static"
+_MOST_OTHERS = 0.01
+_FEWEST_SAMPLES = 4
+
+
+class MeasuredSettings(TopicSettings):
+    """Where a measurement comes from.
+
+    ``topic`` is one of PoseStamped, PointStamped or TransformStamped; ``frame`` is then the frame_id that its headers
+    must have. Of transforms (``/tf``) the pose of ``frame`` in ``reference`` is read. With ``inverted`` poses are those
+    of the instrument in the body, as of a marker that a camera on the hand sees, and their inverses are read.
+    ``clock_offset`` is how far the clock of its stamps is ahead of that of the joints.
+    """
+
+    topic: str
+    frame: str | None = None
+    reference: str | None = None
+    inverted: bool = False
+    clock_offset: Duration = 0.0
+
+    @model_validator(mode="after")
+    def _both_frames(self) -> MeasuredSettings:
+        if self.reference is not None and self.frame is None:
+            raise ValueError("found reference without frame, expected both: the pose of frame in reference")
+        return self
+
+
+class _Tree:
+    """The newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)."""
+
+    def __init__(self) -> None:
+        self.edges: dict[str, tuple[str, Array, float | None]] = {}
+
+    def between(self, reference: str, frame: str) -> tuple[list[str], Array] | None:
+        """The frames on the way from one to another, and the pose of the latter in the former; None without a way."""
+        above, beside = self._above(frame), self._above(reference)
+        if above[-1] != beside[-1]:
+            return None
+        while above and beside and above[-1] == beside[-1]:  # what is above both does not matter
+            above.pop(), beside.pop()
+        return [*above, *beside], np.linalg.inv(self._pose(beside)) @ self._pose(above)
+
+    def _pose(self, names: Sequence[str]) -> Array:
+        return reduce(lambda pose, name: self.edges[name][1] @ pose, names, np.eye(4))
+
+    def _above(self, frame: str) -> list[str]:
+        names = [frame]
+        while names[-1] in self.edges and self.edges[names[-1]][0] not in names:
+            names.append(self.edges[names[-1]][0])
+        return names
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a measurement saw in a rest: a mean pose (4 x 4), the deviation of its place (m), or why there is none."""
+
+    pose: Array
+    deviation: float = float("nan")
+    samples: int = 0
+    fault: str = ""
+
+
+class MeasuredLog:
+    """What a measurement saw, as messages come."""
+
+    def __init__(self, instance: str, settings: MeasuredSettings) -> None:
+        self.instance, self.settings = instance, settings
+        self.stamps = Stamps(settings.topic, settings.stamps)
+        self.types = tuple(_FIELDS) if settings.reference is None else (TRANSFORMS,)
+        self._samples = array("d")  # 8 each: s, m, quaternion xyzw
+        self._tree = _Tree()
+        self._frames = Counter[str]()
+        self._faults = Counter[str]()
+        self._moved_at: float | None = None
+
+    def reads(self, topic: Topic) -> bool:
+        """Whether messages of a topic are for it: its own, and transforms that hold for good."""
+        is_static = self.settings.reference is not None and topic.name.endswith(_STATIC)
+        return topic.type in self.types and (topic.name == self.settings.topic or is_static)
+
+    def add(self, topic: Topic, message: Any, received: int) -> None:
+        """The next message of a topic that it reads."""
+        if topic.type == TRANSFORMS:
+            self._follow(message, received, topic.name.endswith(_STATIC))
+            return
+        self._frames[message.header.frame_id] += 1
+        if self.settings.frame not in (None, message.header.frame_id):
+            return
+        time = self.stamps.time(nanoseconds(message.header.stamp), received)
+        if time is None:
+            return
+        body, position, orientation = _FIELDS[topic.type]
+        held = getattr(message, body) if body else message
+        q = getattr(held, orientation) if orientation else None
+        p = getattr(held, position)
+        turn = None if q is None else np.array([q.x, q.y, q.z, q.w])
+        self._take(time, np.array([p.x, p.y, p.z]), turn)
+
+    def close(self, place: str) -> list[str]:
+        """What was left out, sentences.
+
+        Raises:
+            DataError: nothing was measured, or its frames are not those that were asked for.
+        """
+        s, count = self.settings, self.stamps.count
+        where = f"{place}, data.measurements.{self.instance}"
+        if s.reference is not None and not count:
+            frames = ", ".join(sorted({*self._tree.edges, *(edge[0] for edge in self._tree.edges.values())}))
+            text = f"found no way from the frame {s.reference} to {s.frame} in {s.topic}; its frames are"
+            refuse(where, f"{text} {frames[:400] or 'none'}.", "Correct frame and reference.")
+        listed = ", ".join(f"{name or 'none'} ({some})" for name, some in self._frames.most_common())
+        if not count:
+            refuse(
+                where, f"found {listed or 'no messages'} in {s.topic}, expected the frame {s.frame}.", "Correct frame."
+            )
+        usual = s.frame or max(self._frames, key=lambda name: self._frames[name], default="")
+        others = sum(some for name, some in self._frames.items() if name != usual)
+        if s.frame is None and others > _MOST_OTHERS * count:
+            refuse(where, f"found several frames in {s.topic}: {listed}, expected one.", "Set frame to one of them.")
+        remarks = self.stamps.check(where)
+        if others:
+            remarks.append(f"{others} messages of {s.topic} have other frames than {usual!r}.")
+        if self._faults:
+            faults = ", ".join(f"{some} whose {what}" for what, some in self._faults.most_common())
+            remarks.append(f"of {count} messages of {s.topic} some were left out: {faults}.")
+        return remarks
+
+    def seen(self, rests: Sequence[JointRest], still: RestSettings) -> list[_Seen]:
+        """What it saw in each rest once the arm had settled."""
+        samples, offset = np.array(self._samples).reshape(-1, 8), self.settings.clock_offset
+        spans = np.array([(rest.begin + still.settle, rest.end - GUARD_S) for rest in rests]) + offset
+        return [self._seen(samples[slice(*span)], still.drift) for span in np.searchsorted(samples[:, 0], spans)]
+
+    def _seen(self, rows: Array, drift: float) -> _Seen:
+        nothing = np.full((4, 4), np.nan)
+        if len(rows) < _FEWEST_SAMPLES:
+            fault = f"no measurement ({len(rows)} samples, at least {_FEWEST_SAMPLES})"
+            return _Seen(nothing, samples=len(rows), fault=fault)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        poses[:, :3, 3] = rows[:, 1:4]
+        is_point = bool(np.isnan(rows[0, 4]))
+        poses[:, :3, :3] = np.nan if is_point else Rotation.from_quat(rows[:, 4:]).as_matrix()
+        stillness = judged(poses, drift)
+        if stillness.why_not:
+            return _Seen(nothing, samples=len(rows), fault=stillness.why_not)
+        kept = poses[stillness.kept]
+        mean = mean_pose(kept)
+        return _Seen(mean, float(np.linalg.norm(deviations_of_mean(kept, mean)[:3])), len(kept))
+
+    def _follow(self, message: Any, received: int, is_static: bool) -> None:
+        s, changed = self.settings, set[str]()
+        for part in message.transforms:
+            q = part.transform.rotation
+            if not abs(math.hypot(q.x, q.y, q.z, q.w) - 1) <= _NORM_TOLERANCE:
+                self._faults["quaternion is not of length 1"] += 1
+                continue
+            at = (nanoseconds(part.header.stamp) if s.stamps == "header" else received) / 1e9
+            pose, place, child = np.eye(4), part.transform.translation, part.child_frame_id.lstrip("/")
+            pose[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+            pose[:3, 3] = (place.x, place.y, place.z)
+            self._tree.edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
+            changed.add(child)
+        way = self._tree.between((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
+        if way is None or changed.isdisjoint(way[0]):
+            return
+        # where several frames move, the oldest says when all of the pose was seen
+        times = (self._tree.edges[name][2] for name in way[0])
+        oldest = min((at for at in times if at is not None), default=None)
+        if oldest is None or oldest == self._moved_at:
+            return
+        self._moved_at = oldest
+        time = self.stamps.time(round(oldest * 1e9), received)
+        if time is not None:
+            self._take(time, way[1][:3, 3], Rotation.from_matrix(way[1][:3, :3]).as_quat())
+
+    def _take(self, time: float, position: Array, turn: Array | None) -> None:
+        if not np.isfinite(position).all():
+            self._faults["position is not finite"] += 1
+            return
+        if turn is None:
+            if self.settings.inverted:
+                self._faults["orientation is missing, so that they have no inverse"] += 1
+                return
+            turn = np.full(4, np.nan)
+        elif not abs((norm := float(np.linalg.norm(turn))) - 1) <= _NORM_TOLERANCE:
+            self._faults["quaternion is zero" if norm < _NORM_TOLERANCE else "quaternion is not of length 1"] += 1
+            return
+        elif self.settings.inverted:
+            inverse = Rotation.from_quat(turn).inv()
+            position, turn = -inverse.apply(position), inverse.as_quat()
+        self._samples.extend((time, *position.tolist(), *turn.tolist()))
+
 
 _FEWEST = 26  # Twice the numbers of an affine map of the tool's pose
-_MUCH_BETTER = 10.0  # So many times less is left of inverted poses
-
-
-def joint_channels(request: ReadRequest) -> list[str]:
-    return [f"{name}.{joint}" for name, arm in request.arms.items() for joint in arm.commanded]
+_MUCH_BETTER = 10.0  # So many times less remains of inverted poses
 
 
 def is_inverted(tools: Array, poses: Array) -> bool:
     """Whether it is the inverses of measured poses (N x 4 x 4; nan where there are none) that move as the tools do."""
-    inverted = np.full_like(poses, np.nan)
     turned = np.isfinite(poses).all(axis=(1, 2))
-    inverted[turned] = np.linalg.inv(poses[turned])
-    return _MUCH_BETTER * _left(tools[turned], inverted[turned]) < _left(tools[turned], poses[turned])
+    if turned.sum() < _FEWEST:
+        return False
+    design = np.column_stack([np.ones(turned.sum()), tools[turned, :3].reshape(-1, 12)])
+    off = []
+    for places in (np.linalg.inv(poses[turned])[:, :3, 3], poses[turned, :3, 3]):
+        remaining = places - design @ np.linalg.lstsq(design, places, rcond=None)[0]
+        off.append(float(np.sqrt((remaining**2).mean())))
+    return _MUCH_BETTER * off[0] < off[1]
 
 
-def _left(tools: Array, poses: Array) -> float:
-    known = np.isfinite(poses[:, :3, 3]).all(axis=1)
-    if known.sum() < _FEWEST:
-        return np.inf
-    places, moved = poses[known, :3, 3], tools[known, :3].reshape(-1, 12)
-    design = np.column_stack([np.ones(len(moved)), moved])
-    left = places - design @ np.linalg.lstsq(design, places, rcond=None)[0]
-    return float(np.sqrt((left**2).mean()))
-
-
-_FEWEST_SAMPLES = 4
 _CLOCKS_APART_S = 0.5
 _NAMED = 5
 _FULL_TURN = 2 * np.pi * (1 + 1e-9)
@@ -76,16 +431,6 @@ class BagSettings(Settings):
     still: RestSettings = Field(default_factory=RestSettings)
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What a measurement saw in a rest: a mean pose (4 x 4), the deviation of its place (m), or why there is none."""
-
-    pose: Array
-    deviation: float = float("nan")
-    samples: int = 0
-    fault: str = ""
-
-
 class Rosbag2Reader:
     """The reader ``rosbag2``; ``rows`` and ids number the rests, from 1."""
 
@@ -94,7 +439,6 @@ class Rosbag2Reader:
 
     def __init__(self, settings: BagSettings) -> None:
         self._settings = settings
-        self._digest = hashlib.sha256()
 
     def read(self, request: ReadRequest) -> Dataset:
         """The means of all rests that were measured, in SI; the other rests are set aside with their reasons.
@@ -103,7 +447,7 @@ class Rosbag2Reader:
             DataError: there is no such recording, topic, frame or joint, or no rest that was measured.
             PluginError: rosbags is not there.
         """
-        s, bag = self._settings, Bag(self._settings.path)
+        s, bag, digest = self._settings, Bag(self._settings.path), hashlib.sha256()
         unknown = sorted(set(s.measurements) - set(request.measurements))
         have = ", ".join(request.measurements) or "none"
         if not s.measurements and any(c.channel.partition(".")[0] in request.measurements for c in request.channels):
@@ -111,58 +455,49 @@ class Rosbag2Reader:
             self._refuse(f"found no measurements, expected a topic for one of {have}.", hint)
         if unknown:
             self._refuse(f"found measurements.{unknown[0]}, expected one of {have}.", "Correct the name.")
-        self._digest = hashlib.sha256()
-        joints = self._joints(bag, request)
+        slides = [kind == "length" for arm in request.arms.values() for kind in arm.commanded.values()]
+        channels = self._joint_channels(request)
+        joints = JointLog(tuple(channels.values()), slides, s.joints, s.still)
+        logs = [MeasuredLog(name, own) for name, own in s.measurements.items()]
+        every = (joints, *logs)
+        for topic, received, data, content in bag.messages(lambda topic: any(log.reads(topic) for log in every)):
+            digest.update(data)
+            for log in every:
+                if log.reads(topic):
+                    log.add(topic, content, received)
         remarks = joints.close(str(s.path))
         rests = joints.rests
-        self._refuse_degrees(request, np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest)
+        self._refuse_degrees(
+            request, channels, np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest
+        )
         if not rests:
             hint = "Let the arm stand at each pose, or give a wider spread_deg or a shorter window_s under still."
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
-        logs = [MeasuredLog(name, own, rests) for name, own in s.measurements.items()]
-        self._follow(bag, logs)
-        for log in logs:
-            remarks += log.close(str(s.path)) + self._clock_remarks(log, joints)
-        dataset = self._dataset(request, joints, logs, (*bag.remarks, *remarks))
-        return read_as(dataset, request, by_line=False)
+        types = {topic.name: topic.type for topic in bag.topics}
+        for measured in logs:
+            self._require(measured, types)
+            remarks += measured.close(str(s.path))
+        dataset = self._dataset(request, list(channels), joints, logs, [*bag.remarks, *remarks])
+        return read_as(replace(dataset, sha256=digest.hexdigest()), request, by_line=False)
 
-    def _joints(self, bag: Bag, request: ReadRequest) -> JointLog:
-        """The first time through: joints."""
-        s = self._settings
-        commanded = {name: arm.commanded for name, arm in request.arms.items()}
-        names = channels_of(commanded, s.joints.names)
-        alone = f"{next(iter(commanded))}." if len(commanded) == 1 else ""
-        strange = [name for name in s.joints.names if name not in names and alone + name not in names]
+    def _joint_channels(self, request: ReadRequest) -> dict[str, str]:
+        """The name in the recording of each joint channel (``arm.q1``)."""
+        names = self._settings.joints.names
+        alone = f"{next(iter(request.arms))}." if len(request.arms) == 1 else ""
+        channels = {}
+        for arm, model in request.arms.items():
+            for joint in model.commanded:
+                own = names.get(f"{arm}.{joint}", names.get(joint) if alone else None)
+                channels[f"{arm}.{joint}"] = own or joint
+        strange = [name for name in names if name not in channels and alone + name not in channels]
         if strange:
-            have = ", ".join(name.removeprefix(alone) for name in names)
+            have = ", ".join(name.removeprefix(alone) for name in channels)
             hint = "Correct the name, or leave out what has its own name in the recording."
             self._refuse(f"found joints.names.{strange[0]}, expected joints of the arm: {have}.", hint)
-        if twice := [name for name in names.values() if [*names.values()].count(name) > 1]:
-            both = " and ".join(joint.removeprefix(alone) for joint, name in names.items() if name == twice[0])
+        if twice := [name for name, count in Counter(channels.values()).items() if count > 1]:
+            both = " and ".join(joint.removeprefix(alone) for joint, name in channels.items() if name == twice[0])
             self._refuse(f"found {twice[0]} for {both}, expected one joint of the recording each.", "Correct names.")
-        slides = [kind == "length" for joints in commanded.values() for kind in joints.values()]
-        log = JointLog(tuple(names.values()), slides, s.joints, s.still)
-        self._follow(bag, [], log)
-        return log
-
-    def _follow(self, bag: Bag, logs: Sequence[MeasuredLog], joints: JointLog | None = None) -> None:
-        """Once through the recording; each message goes to those that read its topic."""
-        s = self._settings
-
-        def is_read(topic: Topic) -> bool:
-            is_joints = joints is not None and topic.type == JOINT_STATE and s.joints.topic in (None, topic.name)
-            return is_joints or any(log.reads(topic) for log in logs)
-
-        for topic, received, data, content in bag.messages(is_read):
-            self._digest.update(data)
-            if joints is not None and topic.type == JOINT_STATE:
-                joints.add(topic.name, content, received)
-            for log in logs:
-                if log.reads(topic):
-                    log.add(topic, content, received)
-        types = {topic.name: topic.type for topic in bag.topics}
-        for log in logs:
-            self._require(log, types)
+        return channels
 
     def _require(self, log: MeasuredLog, types: Mapping[str, str]) -> None:
         """Refuse a topic that is not there, or whose messages (types by topic) measure nothing."""
@@ -177,51 +512,43 @@ class Rosbag2Reader:
             hint = "Give reference and frame: the pose of frame in reference is read."
         self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
 
-    def _clock_remarks(self, log: MeasuredLog, joints: JointLog) -> list[str]:
-        apart = joints.stamps.delay - log.stamps.delay
-        if not abs(apart - log.offset) > _CLOCKS_APART_S:
-            return []
-        text = f"stamps of {log.settings.topic} are about {apart:.3g} s ahead of those of {joints.stamps.topic}"
-        return [f"{text}, by the times of receipt. Set clock_offset_s: {apart:.3f} for {log.instance}."]
-
     def _dataset(
-        self, request: ReadRequest, joints: JointLog, logs: Sequence[MeasuredLog], remarks: Sequence[str]
+        self, request: ReadRequest, names: list[str], joints: JointLog, logs: Sequence[MeasuredLog], remarks: list[str]
     ) -> Dataset:
         """A record a rest."""
-        rests, count = joints.rests, len(joints.rests)
-        names = joint_channels(request)
+        rests, still, place = joints.rests, self._settings.still, str(self._settings.path)
         means = np.array([rest.means for rest in rests]).T
         sides = np.array([joints.approach(rest.end) for rest in rests]).T
         channels = dict(zip(names, means, strict=True))
         channels |= {name.replace(".", ".approach.", 1): own for name, own in zip(names, sides, strict=True)}
         channels["time"] = np.array([(rest.begin + rest.end) / 2 for rest in rests])
-        seen = {log.instance: [self._seen(log, i, rest) for i, rest in enumerate(rests)] for log in logs}
         extra = {"rest_s": tuple(f"{rest.end - rest.begin:.3f}" for rest in rests)}
         extra["joint_scatter"] = tuple(f"{rest.scatter.max():.2g}" for rest in rests)
-        for name, own in seen.items():
+        seen = {log.instance: log.seen(rests, still) for log in logs}
+        for log in logs:
+            name, own = log.instance, seen[log.instance]
             channels |= self._measured(name, request, own)
             self._refuse_inverted(request, name, channels, own)
+            remarks += self._clock_remarks(log, joints, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)
         faulty = {}
         for i, rest in enumerate(rests):
             faults = [f"{name}: {own[i].fault}" for name, own in seen.items() if own[i].fault]
-            if rest.end - rest.begin < self._settings.still.window:
-                faulty[i] = f"too short: {rest.end - rest.begin:.2f} s, at least {self._settings.still.window:g} s"
+            if rest.end - rest.begin < still.window:
+                faulty[i] = f"too short: {rest.end - rest.begin:.2f} s, at least {still.window:g} s"
             elif faults and len(faults) == len(seen):
                 faulty[i] = "; ".join(faults)
-        ids, place = tuple(f"rest{i + 1}" for i in range(count)), str(self._settings.path)
-        text = f"{count - len(faulty)} of {count} rests are records"
+        ids = tuple(f"rest{i + 1}" for i in range(len(rests)))
+        text = f"{len(rests) - len(faulty)} of {len(rests)} rests are records"
         if faulty:
             listed = "; ".join(f"{ids[i]}: {reason}" for i, reason in list(faulty.items())[:_NAMED])
             text += f"; left out: {listed}" + (f"; and {len(faulty) - _NAMED} more" if len(faulty) > _NAMED else "")
-        remarks = [*remarks, *self._moving_remarks(logs, joints, seen)]
-        if len(faulty) == count:
+        if len(faulty) == len(rests):
             self._refuse(f"{text}.", " ".join(remarks) or "Let the arm stand where it is measured.")
         warnings = tuple(f"{place}: {remark}" for remark in (*remarks, f"{text}."))
-        digest = self._digest.hexdigest()
-        dataset = Dataset(ids, channels, extra, tuple(range(1, count + 1)), place, digest, warnings=warnings)
-        return dataset.without(faulty)
+        rows = tuple(range(1, len(rests) + 1))
+        return Dataset(ids, channels, extra, rows, place, warnings=warnings).without(faulty)
 
     def _refuse_inverted(
         self, request: ReadRequest, name: str, channels: Mapping[str, Array], seen: Sequence[_Seen]
@@ -235,38 +562,18 @@ class Rosbag2Reader:
             text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm does"
             self._refuse(f"{text}.", mend if settings.reference is None else "Exchange frame and reference.")
 
-    def _moving_remarks(
-        self, logs: Sequence[MeasuredLog], joints: JointLog, seen: Mapping[str, Sequence[_Seen]]
-    ) -> list[str]:
-        remarks = []
-        for log in logs:
-            moves = [bool(one.fault) for one in seen[log.instance] if one.samples >= _FEWEST_SAMPLES]
-            if 2 * sum(moves) > len(moves):
-                apart = joints.stamps.delay - log.stamps.delay
-                remark = f"{log.instance} moves in {sum(moves)} of {len(moves)} rests of the joints. It is on another"
-                remark += f" arm, or not in m; or its clock is another: by the times of receipt it is {apart:.3f} s"
-                remarks.append(f"{remark} ahead, set clock_offset_s: {apart:.3f} for {log.instance}.")
-        return remarks
-
-    def _seen(self, log: MeasuredLog, place: int, rest: JointRest) -> _Seen:
-        """What a measurement saw in a rest once the arm had settled."""
-        s, nothing = self._settings.still, np.full((4, 4), np.nan)
-        rows = log.samples(place)
-        at = rows[:, 0] - log.offset
-        rows = rows[(at >= rest.begin + s.settle) & (at <= rest.end - GUARD_S)]
-        if len(rows) < _FEWEST_SAMPLES:
-            fault = f"no measurement ({len(rows)} samples, at least {_FEWEST_SAMPLES})"
-            return _Seen(nothing, samples=len(rows), fault=fault)
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3, 3] = rows[:, 1:4]
-        is_point = bool(np.isnan(rows[0, 4]))
-        poses[:, :3, :3] = np.nan if is_point else Rotation.from_quat(rows[:, 4:]).as_matrix()
-        stillness = judged(poses, s.drift)
-        if stillness.why_not:
-            return _Seen(nothing, samples=len(rows), fault=stillness.why_not)
-        kept = poses[stillness.kept]
-        mean = mean_pose(kept)
-        return _Seen(mean, float(np.linalg.norm(deviations_of_mean(kept, mean)[:3])), len(kept))
+    def _clock_remarks(self, log: MeasuredLog, joints: JointLog, seen: Sequence[_Seen]) -> list[str]:
+        """By the times of receipt the clocks differ, or a point moves while the joints rest, as if they did."""
+        apart = joints.stamps.delay - log.stamps.delay
+        moves = [bool(one.fault) for one in seen if one.samples >= _FEWEST_SAMPLES]
+        found = f"stamps of {log.settings.topic} are about {apart:.3g} s ahead of those of {joints.stamps.topic}"
+        if abs(apart - log.settings.clock_offset) > _CLOCKS_APART_S:
+            return [f"{found}, by the times of receipt. Set clock_offset_s: {apart:.3f} for {log.instance}."]
+        if 2 * sum(moves) <= len(moves):
+            return []
+        text = f"{log.instance} moves in {sum(moves)} of {len(moves)} rests of the joints. It is on another arm, or not"
+        text += f" in m; or its clock is another: by the times of receipt {found}"
+        return [f"{text}, set clock_offset_s: {apart:.3f} for {log.instance}."]
 
     def _measured(self, name: str, request: ReadRequest, seen: Sequence[_Seen]) -> dict[str, Array]:
         """The channels of a measurement, NaN where it saw nothing.
@@ -275,12 +582,11 @@ class Rosbag2Reader:
             DataError: it reads what no pose has, or orientations of points.
         """
         poses = np.array([one.pose for one in seen])
-        values = {axis: poses[:, i, 3] for i, axis in enumerate("xyz")}
         turned = np.isfinite(poses[:, 0, 0])
+        values = {axis: poses[:, i, 3] for i, axis in enumerate("xyz")}
         quaternions = np.full((len(poses), 4), np.nan)
         if turned.any():
-            quaternions[turned] = Rotation.from_matrix(poses[turned, :3, :3]).as_quat()
-            quaternions[quaternions[:, 3] < 0] *= -1
+            quaternions[turned] = Rotation.from_matrix(poses[turned, :3, :3]).as_quat(canonical=True)
         values |= {axis: quaternions[:, i] for i, axis in enumerate(("qx", "qy", "qz", "qw"))}
         needed = [channel.name for channel in request.measurements[name].channels()]
         lacking = [own for own in needed if own not in values]
@@ -292,10 +598,10 @@ class Rosbag2Reader:
             self._refuse(f"{name} reads orientations, and {topic} has points.", "Set type: tip_position.")
         return {f"{name}.{own}": values[own] for own in needed}
 
-    def _refuse_degrees(self, request: ReadRequest, positions: Array) -> None:
+    def _refuse_degrees(self, request: ReadRequest, names: Iterable[str], positions: Array) -> None:
         """Angles beyond one turn of joints that do not turn on and on."""
         turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
-        for name, largest in zip(joint_channels(request), positions, strict=True):
+        for name, largest in zip(names, positions, strict=True):
             if name in turning and largest > _FULL_TURN:
                 hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
                 self._refuse(f"{name} stands at {largest:.6g} rad, more than one turn (2 pi rad).", hint)

@@ -15,7 +15,7 @@ from armcal.base.dataset import Dataset
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal_ros2.bag import Bag
-from armcal_ros2.survey import survey
+from armcal_ros2.bag_command import survey
 from rosbags.rosbag2 import Reader
 
 KINDS = [("mcap", ""), ("mcap", "storage"), ("sqlite3", "")]
