@@ -1,6 +1,5 @@
 """``armcal board``: a board as a page to print (PDF and SVG, to scale, with a ruler), and its settings."""
 
-from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +15,7 @@ from armcal.io.plain_files import write_new, write_over
 from armcal.plugins import library
 from pydantic import ValidationError
 
-from armcal_camera.board import Aprilgrid, Board, BoardFile, Charuco, Chessboard, Tag, dark_rectangles, outline
+from armcal_camera.board import Aprilgrid, Board, BoardFile, Charuco, Chessboard, dark_rectangles, outline
 
 PAPERS = MappingProxyType(
     {
@@ -111,8 +110,12 @@ def pages_of(board: Board, paper: str) -> dict[str, bytes]:
     ticks = _MARGIN_MM + np.arange(11) * (RULER_MM - _LINE_MM) / 10
     line = [[(_MARGIN_MM, foot - _LINE_MM), (_MARGIN_MM + RULER_MM, foot)]]
     _fill(axes, np.array(line + [[(tick, foot - _TICK_MM), (tick + _LINE_MM, foot)] for tick in ticks]))
+    stated = (
+        f"{name.removesuffix('_m')} {1000 * value:g} mm" if name.endswith("_m") else f"{name} {value}"
+        for name, value in board.to_config().items()
+    )
     lines = (
-        (12.8, _what(board)),
+        (12.8, f"armcal: {', '.join(stated)}"),
         (8.6, f"Print at 100 %, not fitted to the page. The line is {RULER_MM:g} mm long: measure it."),
         (
             1.4 + _TICK_MM,
@@ -141,39 +144,20 @@ def _fill(axes: Any, rectangles: Array) -> None:
 
 
 def page_of(board: Board, paper: str) -> tuple[float, float]:
-    """Width and height of the page (mm)."""
-    size = 1000 * np.array(board.layout.extent)
+    """Width and height of the page (mm), upright where there is room so."""
     quiet = 0.0 if isinstance(board, Chessboard | Charuco) else 100 * board.layout.step  # white around tags
-    pages = [page for page in _both(paper) if _fits(size + 2 * quiet, page)]
-    if pages:
-        return pages[0]
-    room = " or ".join(f"{w - 2 * _MARGIN_MM:g} x {h - 2 * _MARGIN_MM - _FOOT_MM:g}" for w, h in _both(paper))
-    larger = [name for name in PAPERS if any(_fits(size + 2 * quiet, page) for page in _both(name))]
-    mend = f"take --paper {larger[0]}, or a smaller board" if larger else "take a smaller board"
-    needed = size + 2 * quiet
+    needed = 1000 * np.array(board.layout.extent) + 2 * quiet
+    border = np.array([2 * _MARGIN_MM, 2 * _MARGIN_MM + _FOOT_MM])
+    fitting = {
+        name: page
+        for name, upright in PAPERS.items()
+        for page in (upright[::-1], upright)
+        if (needed <= np.array(page) - border + 1e-9).all()
+    }
+    if paper in fitting:
+        return fitting[paper]
+    room = " or ".join(f"{w:g} x {h:g}" for w, h in np.array([PAPERS[paper], PAPERS[paper][::-1]]) - border)
+    larger = next(iter(fitting), None)
+    mend = f"take --paper {larger}, or a smaller board" if larger else "take a smaller board"
     text = f"the board needs {needed[0]:g} x {needed[1]:g} mm, and {paper} has room for {room} mm"
     raise ValueError(f"{text}: {mend}")
-
-
-def _both(paper: str) -> tuple[tuple[float, float], ...]:
-    return PAPERS[paper], PAPERS[paper][::-1]
-
-
-def _fits(size: Array, page: Sequence[float]) -> bool:
-    room = np.array(page) - 2 * _MARGIN_MM - np.array([0.0, _FOOT_MM])
-    return bool((size <= room + 1e-9).all())
-
-
-def _what(board: Board) -> str:
-    """The board in words."""
-    if isinstance(board, Chessboard):
-        return f"armcal: chessboard, {board.columns} x {board.rows} inner corners, square {1000 * board.square:g} mm"
-    if isinstance(board, Charuco):
-        sizes = f"square {1000 * board.square:g} mm, marker {1000 * board.marker:g} mm"
-        tags = f"{board.dictionary} from {board.first_id}"
-        return f"armcal: ChArUco, {board.columns} x {board.rows} squares, {sizes}, {tags}"
-    if isinstance(board, Aprilgrid):
-        sizes = f"tag {1000 * board.tag:g} mm, spacing {1000 * board.spacing:g} mm"
-        return f"armcal: AprilTag grid, {board.columns} x {board.rows}, {sizes}, {board.family} from {board.first_id}"
-    assert isinstance(board, Tag)
-    return f"armcal: tag {board.id} of {board.family}, edge {1000 * board.tag:g} mm"

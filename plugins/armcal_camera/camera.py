@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,182 +14,18 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import PoseSettings, pose_transform
-from armcal.base.quaternions import quaternion_of
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings, PointInstrument, Proposal, Reading, spread_points
 from armcal.measure.measurement import Channel, Mistake
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
-from armcal_camera.hand_eye import FEWEST_POINTS, board_pose, hand_eye, intrinsics, open_motion, pose_matrix
-from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, normalised, projected
-from armcal_camera.mixed_up import require_board_axes, require_form, require_one_board
+from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, projected
 from armcal_camera.render import rendered_records
-
-_INTRINSICS = ("fx", "fy", "cx", "cy")
-_FEWEST_VIEWS, _MOST_VIEWS = 3, 30
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What of a camera's settings a start depends on."""
-
-    names: tuple[str, ...]  # the first part of the names of each board's parameters
-    points: tuple[Array, ...]  # of each board those that are used (P x 3, m)
-    lens: str  # ``pinhole`` or ``fisheye``
-    is_stated: bool  # whether its intrinsics are
-    frames: tuple[str, str]  # which carry the camera and the boards
-
-
-@dataclass(frozen=True)
-class _View:
-    """A board in a record: its points (n x 2, m) and where they appear (n x 2, thousands of pixels)."""
-
-    record: int
-    board: int
-    points: Array
-    image: Array
-
-
-def first_guess(setup: Setup, reading: Reading) -> Proposal:
-    """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``.
-
-    With A the frame of the camera as seen from that of the boards, A camera_pose = board_pose camera_T_board^-1 in
-    every record: one equation wherever camera and boards are. Boards whose place is held or another camera's do where
-    the motion leaves it open.
-
-    Raises:
-        ProblemError: the images cannot be of what is stated.
-    """
-    own, free = dict(reading.values), reading.free
-    views = _views(setup, reading)
-    require_board_axes([(v.points, v.image) for v in views if len(v.points) == len(setup.points[v.board])])
-    if free & set(_INTRINSICS) and not setup.is_stated:
-        own |= _intrinsics(views, free)
-    poses = _poses(setup, views, own)
-    proposed = {name: own[name] for name in _INTRINSICS if name in free}
-    (camera_frame, board_frame), moved = setup.frames, _moved(setup, reading)
-    known = [not free & set(_place(name)) for name in setup.names]
-    is_open = open_motion(moved, camera_frame)
-    if camera_frame == board_frame:
-        is_open = (
-            f"camera and boards are both on the frame {camera_frame} and never move against one another: where they "
-            "are is not determined.",
-            "Name a camera that moves against the same boards in boards_of, or state board_poses and hold them.",
-        )
-    for own_poses in poses if is_open is None else ():
-        if len(own_poses):
-            hand, board_ = moved[list(own_poses)], np.array(list(own_poses.values()))
-            require_form(hand, board_)
-            require_one_board(hand, board_, [reading.ids[i] for i in own_poses])
-    if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
-        return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
-    boards = [board for board in zip(setup.names, poses, known, strict=True) if board[1]]
-    boards.sort(key=lambda board: (is_open is not None and not board[2], -len(board[1])))
-    return Proposal({**proposed, **_places(boards, moved, own, free)})
-
-
-def _places(
-    boards: Sequence[tuple[str, dict[int, Array], bool]], moved: Array, own: Mapping[str, Array], free: frozenset[str]
-) -> dict[str, Array]:
-    """Places of the camera and of boards (name, camera_T_board by record, whether its own place is known)."""
-    proposed, camera_pose = dict[str, Array](), None
-    for name, poses, is_known in boards:
-        a, b = moved[list(poses)], np.array(list(poses.values()))
-        if camera_pose is None and _placed("camera", free):
-            solved = hand_eye(a, np.linalg.inv(b))
-            if solved is None and not is_known:
-                continue
-            every = np.linalg.inv(a) @ pose_matrix(name, own) @ np.linalg.inv(b)
-            camera_pose = every[_middle(every)] if solved is None else solved.x
-            board_pose_ = pose_matrix(name, own) if solved is None else solved.y
-            proposed |= _pose_values("camera", camera_pose)
-        else:
-            every = a @ (pose_matrix("camera", own) if camera_pose is None else camera_pose) @ b
-            board_pose_ = every[_middle(every)]
-        if _placed(name, free):
-            proposed |= _pose_values(name, board_pose_)
-    return proposed
-
-
-def _moved(setup: Setup, reading: Reading) -> Array:
-    """The frame of the camera as seen from that of the boards in each record (N x 4 x 4, m)."""
-    camera_frame, board_frame = setup.frames
-    return np.asarray(np.linalg.inv(reading.frames[board_frame]) @ reading.frames[camera_frame])
-
-
-def _place(name: str) -> tuple[str, ...]:
-    return tuple(f"{name}_{part}" for part in ("x", "y", "z", "rotation"))
-
-
-def _placed(name: str, free: frozenset[str]) -> bool:
-    return set(_place(name)) <= free
-
-
-def _views(setup: Setup, reading: Reading) -> list[_View]:
-    """Every board in every record of which enough points are there."""
-    total = sum(map(len, setup.points))
-    scale = float(reading.values["board_scale"][0])
-    image = np.array(list(reading.channels.values())).reshape(total, 2, -1)
-    views, start = [], 0
-    for number, board in enumerate(setup.points):
-        part, points = image[start : start + len(board)], scale * board[:, :2]
-        start += len(points)
-        for record in range(image.shape[2]):
-            there = np.isfinite(part[:, :, record]).all(axis=1)
-            if there.sum() >= FEWEST_POINTS and np.linalg.matrix_rank(np.c_[points[there], np.ones(there.sum())]) == 3:
-                views.append(_View(record, number, points[there], part[there, :, record]))
-    return views
-
-
-def _fullest(views: Sequence[_View]) -> list[_View]:
-    """Those with at least half as many points as their board's fullest: few say little of a pose or of a lens."""
-    most: dict[int, int] = {}
-    for view in views:
-        most[view.board] = max(len(view.points), most.get(view.board, 0))
-    return [view for view in views if 2 * len(view.points) >= most[view.board]]
-
-
-def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
-    """Those that views determine; where they do not, a lens of ordinary width about the middle."""
-    whole = np.concatenate([view.image for view in views]) if views else np.array([[0.5, 0.5]])
-    middle = (whole.min(axis=0) + whole.max(axis=0)) / 2
-    size = float(np.max(whole.max(axis=0) - whole.min(axis=0)))
-    full = [(view.points, view.image - middle) for view in _fullest(views)]
-    full = full[:: max(1, len(full) // _MOST_VIEWS)]
-    solved = intrinsics(full, size) if len(full) >= _FEWEST_VIEWS else None
-    off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
-    if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:
-        solved = (1.2 * size, 1.2 * size, 0.0, 0.0)
-    start = dict(zip(_INTRINSICS, (solved[0], solved[1], *(middle + solved[2:])), strict=True))
-    return {name: np.array([value]) for name, value in start.items() if name in free}
-
-
-def _poses(setup: Setup, views: list[_View], values: Mapping[str, Array]) -> list[dict[int, Array]]:
-    """camera_T_board of each board, by record (4 x 4, m)."""
-    focal, centre = (np.concatenate([values[a], values[b]]) for a, b in (("fx", "fy"), ("cx", "cy")))
-    lens = setup.lens
-    distortion = np.concatenate([values[name] for name in DISTORTION[lens]])
-    poses: list[dict[int, Array]] = [{} for _ in setup.names]
-    for view in _fullest(views):
-        seen = normalised(lens, view.image.T, focal, centre, distortion).T
-        poses[view.board][view.record] = board_pose(view.points, seen)
-    return poses
-
-
-def _pose_values(name: str, pose: Array) -> dict[str, Array]:
-    place = {f"{name}_{axis}": pose[i : i + 1, 3] for i, axis in enumerate("xyz")}
-    return {**place, f"{name}_rotation": np.array(quaternion_of(pose[:3, :3]))}
-
-
-def _middle(poses: Array) -> int:
-    """Of poses that should be one (N x 4 x 4), the one nearest to the others."""
-    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
-    return int(np.argmin(np.median(apart, axis=1)))
-
+from armcal_camera.start import FEWEST_POINTS, first_guess
 
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE, _BEND_SCALE_M = 0.01, 0.05, 0.01, 1e-3
-_NEAREST_M, _LEAST_FACING, _FEWEST_POINTS = 0.02, 0.3, 4
+_NEAREST_M, _LEAST_FACING = 0.02, 0.3
 _POSITIVE = Interval(1e-6, np.inf)
 
 
@@ -242,11 +77,6 @@ class CameraSettings(InstrumentSettings):
     def model(self) -> Lens:
         """The lens: as stated, else as the file of intrinsics states it, else a pinhole."""
         return self.lens or (self.intrinsics.model if self.intrinsics else None) or "pinhole"
-
-
-def carrying_frames(mounting: str, frame: str, board_frame: str | None) -> tuple[str, str]:
-    carrying = (frame, BASE_FRAME) if mounting == "eye_in_hand" else (BASE_FRAME, frame)
-    return carrying[0], board_frame or carrying[1]
 
 
 def bent(board: Board, place: Any, heights: Sequence[Any]) -> Any:
@@ -322,12 +152,14 @@ class Camera(PointInstrument):
     @property
     def camera_frame(self) -> str:
         """In which frame the camera is: ``base``, or that which carries it."""
-        return carrying_frames(self.settings.mounting, self.settings.frame, self.settings.board_frame)[0]
+        return self.settings.frame if self.settings.mounting == "eye_in_hand" else BASE_FRAME
 
     @property
     def board_frame(self) -> str:
         """In which frame the boards are: ``base``, or that which carries them."""
-        return carrying_frames(self.settings.mounting, self.settings.frame, self.settings.board_frame)[1]
+        return self.settings.board_frame or (
+            BASE_FRAME if self.settings.mounting == "eye_in_hand" else self.settings.frame
+        )
 
     @cached_property
     def boards(self) -> tuple[Board, ...]:
@@ -425,13 +257,10 @@ class Camera(PointInstrument):
         visible, start = margins > 0, 0
         for board, used in zip(self.boards, self.used, strict=True):
             own = visible[start : start + len(used)]
-            enough = own.all(axis=0) if isinstance(board, Chessboard) else own.sum(axis=0) >= _FEWEST_POINTS
+            enough = own.all(axis=0) if isinstance(board, Chessboard) else own.sum(axis=0) >= FEWEST_POINTS
             visible[start : start + len(used)] = own & enough
             start += len(used)
         return np.asarray(visible)
-
-    def dimensions(self) -> Sequence[str]:
-        return ("image",) * len(self.noise())
 
     @property
     def place(self) -> tuple[str, str]:
@@ -461,10 +290,4 @@ class Camera(PointInstrument):
 
     def propose(self, reading: Reading) -> Proposal:
         """Where a fit may start, from the images alone; see ``Proposing``."""
-        return first_guess(self._setup, reading)
-
-    @property
-    def _setup(self) -> Setup:
-        s = self.settings
-        points = tuple(board.points[used] for board, used in zip(self.boards, self.used, strict=True))
-        return Setup(self.board_names, points, s.model, s.intrinsics is not None, (self.camera_frame, self.board_frame))
+        return first_guess(self, reading)

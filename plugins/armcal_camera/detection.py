@@ -47,25 +47,15 @@ class Refined:
 _FIELDS = ("corners", "blur", "crossing")
 
 
-@dataclass(frozen=True)
-class _Patches:
-    """Pixels around corners: ``x`` and ``y`` from the middle (M), grey values and weights of 0 or 1 (N x M)."""
-
-    x: Array
-    y: Array
-    grey: Array
-    weight: Array
+_Patches = tuple[Array, Array, Array, Array]
+"""Pixels around corners: x and y from the middle (M), grey values and weights of 0 or 1 (N x M)."""
 
 
 def refine(image: Array | Grey, corners: Array, scale: Array, reach: float) -> Refined:
-    """Fit the edges at each corner.
+    """Fit the edges at each corner, from about where it is (N x 2, px; a pixel's centre has whole coordinates).
 
-    Args:
-        image: grey values (H x W).
-        corners: about where they are (N x 2, px; a pixel's centre has whole coordinates).
-        scale: derivative of the image's coordinates by the board's, which also says where the edges point
-            (N x 2 x 2, px/m).
-        reach: how far from a corner there is nothing but its own edges (m).
+    ``scale`` is the derivative of the image's coordinates by the board's, which also says where the edges point
+    (N x 2 x 2, px/m); within ``reach`` (m) of a corner there is nothing but its own edges.
     """
     parts = [
         _refined(image, corners[i : i + _AT_ONCE], scale[i : i + _AT_ONCE], reach)
@@ -100,7 +90,7 @@ def _patches(image: Array | Grey, middles: Array, scale: Array, reach: float) ->
     grey = image[at_y.clip(0, height - 1), at_x.clip(0, width - 1)].astype(float)
     away = np.linalg.pinv(scale) @ np.stack([x, y]).astype(float)
     near = (np.hypot(away[:, 0], away[:, 1]) <= reach) | (np.hypot(x, y) <= _SMALLEST)
-    return _Patches(x.astype(float), y.astype(float), grey, (inside & near).astype(float))
+    return x.astype(float), y.astype(float), grey, (inside & near).astype(float)
 
 
 def _fitted(patches: _Patches, start: Array) -> tuple[Array, Array, Array]:
@@ -126,13 +116,13 @@ def _fitted(patches: _Patches, start: Array) -> tuple[Array, Array, Array]:
         damping = np.where(better, damping / 10, damping * 10)
         if np.abs(step[:, :2]).max() < _ENOUGH_PX:
             break
-    pixels = np.maximum(patches.weight.sum(axis=1), 1.0)
-    return parameters, grey, np.sqrt((misfit**2).sum(axis=1) / pixels)
+    return parameters, grey, np.sqrt((misfit**2).sum(axis=1) / np.maximum(patches[3].sum(axis=1), 1.0))
 
 
 def _at(patches: _Patches, parameters: Array) -> tuple[Array, Array, Array]:
     """The best greys for these edges, the misfit (N x M), and its negative derivatives (N x M x 9)."""
-    dx, dy = patches.x - parameters[:, 0:1], patches.y - parameters[:, 1:2]
+    x, y, pixels, weight = patches
+    dx, dy = x - parameters[:, 0:1], y - parameters[:, 1:2]
     width = np.exp(parameters[:, 4:5])
     sines, cosines = np.sin(parameters[:, 2:4]), np.cos(parameters[:, 2:4])
     steps, rises, d = [], [], []
@@ -141,12 +131,11 @@ def _at(patches: _Patches, parameters: Array) -> tuple[Array, Array, Array]:
         d.append(distance)
         steps.append(erf(distance))
         rises.append(2 / math.sqrt(math.pi) / width * np.exp(-(distance**2)))
-    weight = patches.weight
     basis = np.stack([np.ones_like(dx), *steps, steps[0] * steps[1]], axis=2) * weight[..., None]
     normal = np.swapaxes(basis, 1, 2) @ basis + 1e-9 * np.eye(4)
-    moments = np.swapaxes(basis, 1, 2) @ (weight * patches.grey)[..., None]
+    moments = np.swapaxes(basis, 1, 2) @ (weight * pixels)[..., None]
     grey = np.linalg.solve(normal, moments)[..., 0]
-    misfit = weight * patches.grey - (basis @ grey[..., None])[..., 0]
+    misfit = weight * pixels - (basis @ grey[..., None])[..., 0]
     q1, q2, q3 = (grey[:, i : i + 1] for i in (1, 2, 3))
     first, second = weight * rises[0] * (q1 + q3 * steps[1]), weight * rises[1] * (q2 + q3 * steps[0])
     s1, s2, c1, c2 = sines[:, :1], sines[:, 1:], cosines[:, :1], cosines[:, 1:]
@@ -161,18 +150,10 @@ def _at(patches: _Patches, parameters: Array) -> tuple[Array, Array, Array]:
 
 
 def local_map(points: Array, pixels: Array, places: Array, own: bool = True) -> tuple[Array, Array]:
-    """Where places of a board are in the image, and how the image changes there.
+    """Where places of a board (M x 2, m) are in the image (px), and the derivative there (M x 2 x 2, px/m).
 
-    Neighbours count by the inverse fourth power of their distance, so that neither perspective nor distortion matters.
-
-    Args:
-        points: of the board (N x 2, m).
-        pixels: where they are in the image (N x 2, px).
-        places: of the board (M x 2, m).
-        own: whether a point at the very place counts.
-
-    Returns:
-        The pixels (M x 2) and their derivative by the board's coordinates (M x 2 x 2, px/m).
+    Of points of the board (N x 2, m) it is known where they are (N x 2, px); ``own`` says whether one at the very place
+    counts. Neighbours count by the inverse fourth power of their distance: neither perspective nor distortion matters.
     """
     away = points[None] - places[:, None]
     squares = (away**2).sum(axis=2)
@@ -203,14 +184,7 @@ def upright(grid: Array, crossing: Array) -> tuple[Array, Array]:
 
     Where the pattern is the same after a half turn (columns and rows both odd or both even), or after a quarter turn
     (as many columns as rows), x points as far to the right of the image as it can: the origin is then the same in all
-    images only as long as the camera rolls by less than 90 (45) degrees.
-
-    Args:
-        grid: corners (R x C x 2, px).
-        crossing: of each (R x C), as ``Refined`` has it.
-
-    Returns:
-        Both, turned alike.
+    images only as long as the camera rolls by less than 90 (45) degrees. ``crossing`` is as ``Refined`` has it (R x C).
     """
     right, down = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0), grid[-1].mean(axis=0) - grid[0].mean(axis=0)
     if right[0] * down[1] - right[1] * down[0] < 0:

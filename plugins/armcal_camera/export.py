@@ -12,7 +12,7 @@ from armcal.calibration.exporter import Exported, ExportRequest, Instrument
 from armcal.errors import ConfigError
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.camera import carrying_frames
+from armcal_camera.camera import Camera, CameraSettings
 from armcal_camera.images import opencv
 from armcal_camera.intrinsics import DISTORTION
 
@@ -45,8 +45,8 @@ class _CameraExporter:
     def __init__(self, settings: Any) -> None:
         self._settings = settings
 
-    def _camera(self, request: ExportRequest) -> tuple[str, Instrument]:
-        """The camera that is meant.
+    def _camera(self, request: ExportRequest) -> tuple[str, Instrument, Camera]:
+        """The camera that is meant: its name, its numbers, and what its settings make of it.
 
         Raises:
             ConfigError: there is none, or several and none is named.
@@ -59,7 +59,9 @@ class _CameraExporter:
                 f"found the cameras {have} in the calibration, expected {self._settings.camera or 'one'}.",
                 hint="Name one of them: camera=NAME." if cameras else "Calibrate a measurement of type camera.",
             )
-        return chosen, cameras[chosen]
+        stated = {key: value for key, value in cameras[chosen].settings.items() if key != "type"}
+        settings = CameraSettings.model_validate(stated)
+        return chosen, cameras[chosen], Camera(settings, (settings.arm or "arm",))
 
 
 class CameraInfoExporter(_CameraExporter):
@@ -71,8 +73,8 @@ class CameraInfoExporter(_CameraExporter):
         Raises:
             ConfigError: no such camera, or its image size is not stated.
         """
-        name, camera = self._camera(request)
-        matrix, distortion, size = _intrinsics(camera)
+        name, instrument, camera = self._camera(request)
+        matrix, distortion, size = _intrinsics(instrument, camera)
         if size is None:
             raise ConfigError(
                 f"the camera {name} does not state its image size, which camera_info needs.",
@@ -85,7 +87,7 @@ class CameraInfoExporter(_CameraExporter):
             "image_height": size[1],
             "camera_name": name,
             "camera_matrix": {"rows": 3, "cols": 3, "data": flat},
-            "distortion_model": _MODELS[_model(camera)],
+            "distortion_model": _MODELS[camera.settings.model],
             "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
             "rectification_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in np.eye(3).ravel()]},
             "projection_matrix": {"rows": 3, "cols": 4, "data": projection},
@@ -102,19 +104,19 @@ class OpenCvExporter(_CameraExporter):
         Raises:
             ConfigError: no such camera.
         """
-        _, camera = self._camera(request)
-        matrix, distortion, size = _intrinsics(camera)
+        _, instrument, camera = self._camera(request)
+        matrix, distortion, size = _intrinsics(instrument, camera)
         cv2 = opencv()
         storage = cv2.FileStorage("camera.yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
         for key, length in zip(("image_width", "image_height"), size or (), strict=False):
             storage.write(key, length)
         storage.write("camera_matrix", matrix)
         storage.write("distortion_coefficients", np.array([distortion]))
-        frames = _frames(camera)
-        storage.write(f"{frames[0]}_T_camera", _pose("camera", camera.numbers))
-        turned = (entry.removesuffix("_rotation[w]") for entry in camera.numbers if entry.endswith("_rotation[w]"))
+        numbers = instrument.numbers
+        storage.write(f"{camera.camera_frame}_T_camera", _pose("camera", numbers))
+        turned = (entry.removesuffix("_rotation[w]") for entry in numbers if entry.endswith("_rotation[w]"))
         for board in (name for name in turned if name.startswith("board")):
-            storage.write(f"{frames[1]}_T_{board}", _pose(board, camera.numbers))
+            storage.write(f"{camera.board_frame}_T_{board}", _pose(board, numbers))
         return Exported(storage.releaseAndGetString().encode(), 4 + len(distortion))
 
 
@@ -130,17 +132,17 @@ class HandEyeExporter(_CameraExporter):
         Raises:
             ConfigError: no such camera.
         """
-        name, camera = self._camera(request)
-        frames = _frames(camera)
-        on_hand, carrier = frames[0] != BASE_FRAME, frames[frames[0] == BASE_FRAME]
+        name, instrument, camera = self._camera(request)
+        on_hand = camera.camera_frame != BASE_FRAME
+        carrier = camera.camera_frame if on_hand else camera.board_frame
         tool_frame = self._settings.tool_frame or ("tool0" if carrier == TOOL_FRAME else carrier)
         parent = tool_frame if on_hand else self._settings.base_frame
-        pose, child = _pose("camera", camera.numbers), self._settings.camera_frame
+        pose, child = _pose("camera", instrument.numbers), self._settings.camera_frame
         place, quaternion = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
         there, turned = dict(zip("xyz", place, strict=True)), dict(zip("xyzw", quaternion, strict=True))
         stem = request.out.rpartition("/")[2].rpartition(".")[0] or "camera"
         first, second = self._easy_handeye(stem, on_hand, tool_frame, there, turned)
-        first["standard_deviation_m"] = {axis: camera.deviations.get(f"camera_{axis}") for axis in "xyz"}
+        first["standard_deviation_m"] = {axis: instrument.deviations.get(f"camera_{axis}") for axis in "xyz"}
         numbers = " ".join(f"--{k} {x:.9g}" for k, x in first["transformation"].items())
         command = f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id {parent} --child-frame-id {child}"
         title = f"# {parent} to {child}, in metres: the camera {name}.\n"
@@ -178,24 +180,12 @@ class HandEyeExporter(_CameraExporter):
         return first, second
 
 
-def _intrinsics(camera: Instrument) -> tuple[Array, list[float], tuple[int, int] | None]:
+def _intrinsics(instrument: Instrument, camera: Camera) -> tuple[Array, list[float], tuple[int, int] | None]:
     """Camera matrix (px), distortion coefficients, and width and height (px) where they are stated."""
-    n = camera.numbers
+    n = instrument.numbers
     matrix = np.array([[_PX * n["fx"], 0, _PX * n["cx"]], [0, _PX * n["fy"], _PX * n["cy"]], [0, 0, 1.0]])
-    distortion = [n[name] for name in DISTORTION[_model(camera)]]
-    stated = camera.settings.get("intrinsics") or {}
-    size = camera.settings.get("image_kpx") or stated.get("image_kpx")
-    return matrix, distortion, None if size is None else (round(_PX * size[0]), round(_PX * size[1]))
-
-
-def _model(camera: Instrument) -> str:
-    stated = camera.settings.get("intrinsics") or {}
-    return str(camera.settings.get("lens") or stated.get("model") or "pinhole")
-
-
-def _frames(camera: Instrument) -> tuple[str, str]:
-    s = camera.settings
-    return carrying_frames(s.get("mounting", "eye_in_hand"), s.get("frame", TOOL_FRAME), s.get("board_frame"))
+    size = camera.image and (round(_PX * camera.image[0]), round(_PX * camera.image[1]))
+    return matrix, [n[name] for name in DISTORTION[camera.settings.model]], size
 
 
 def _pose(name: str, numbers: Mapping[str, float]) -> Array:

@@ -1,21 +1,14 @@
-"""Records from images: a folder of them, and a file that says where the arm stood for each.
-
-Corners as CSV in long form, for those who detect them with other programs: ``image,board,point,u_px,v_px``.
-
-``board`` counts from 0, and may be left out where there is one; ``point`` counts each board's points from 0. The
-centre of an image's first pixel is at 0, 0.
-"""
+"""Records from images: a folder of them, and a file that says where the arm stood for each."""
 
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeGuard, runtime_checkable
+from typing import Any, ClassVar
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -24,76 +17,15 @@ from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.io.parallel import Automatic, Report
-from armcal.io.plain_files import input_bytes, refuse, write_over
+from armcal.io.plain_files import input_bytes, refuse
+from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest
-from armcal.measure.tables import open_table
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armcal_camera.board import Board
 from armcal_camera.detection import detect
 from armcal_camera.images import MOST_BYTES, grey_image, is_image
 from armcal_camera.pose_table import read_poses
-
-COLUMNS = ("image", "board", "point", "u_px", "v_px")
-_MAX_BYTES = 512 * 1024**2
-_LAYOUT = f"Give a header {','.join(COLUMNS)} and a line a corner."
-
-
-def read_corners(path: Path, boards: Sequence[Board]) -> tuple[dict[str, Array], str]:
-    """The corners of each image (K x 2 over all boards, px), in the order in which images appear; and their sha256.
-
-    Raises:
-        DataError: with line and column.
-    """
-    with open_table(path, "a CSV file of corners", most=_MAX_BYTES, empty=_LAYOUT) as table:
-        header = [cell.strip() for cell in table.first[1]]
-        missing = [name for name in COLUMNS if name not in header and (name != "board" or len(boards) > 1)]
-        if missing:
-            text = f"found the columns {', '.join(header) or 'none'}, expected {', '.join(missing)} as well."
-            refuse(path, text, _LAYOUT, 1)
-        texts = [header.index(name) for name in ("image", "point", "board") if name in header]
-        pixels = [(header.index(name), name) for name in ("u_px", "v_px")]
-        read = table.columns(pixels, texts)
-    images, points, *named = read.texts
-    starts = np.cumsum([0, *(len(board.points) for board in boards)])
-    corners: dict[str, Array] = {}
-    for i, (line, u, v) in enumerate(zip(read.lines, *read.numbers, strict=True)):
-        board = _count(path, line, "board", named[0][i], len(boards)) if named else 0
-        point = _count(path, line, "point", points[i], len(boards[board].points))
-        own = corners.setdefault(images[i].strip(), np.full((starts[-1], 2), np.nan))
-        place = own[starts[board] + point]
-        if not np.isnan(place).all():
-            refuse(path, f"found the point {point} of this image again.", "Remove one of the lines.", line, "point")
-        if np.isinf((u, v)).any():
-            column = "u_px" if np.isinf(u) else "v_px"
-            refuse(path, "found an infinite number, expected pixels.", "Leave the line out.", line, column)
-        place[:] = u, v
-    if not corners:
-        refuse(path, "found a header and no corners.", _LAYOUT)
-    return corners, table.sha256
-
-
-def corners_text(corners: Mapping[str, Array], boards: Sequence[Board]) -> str:
-    """The file that says the same; corners that were not seen are left out."""
-    places = [(number, point) for number, board in enumerate(boards) for point in range(len(board.points))]
-    lines = [",".join(COLUMNS)]
-    for image, pixels in corners.items():
-        shown = f'"{image}"' if "," in image else image
-        lines += [
-            f"{shown},{board},{point},{u:.5f},{v:.5f}"
-            for (board, point), (u, v) in zip(places, pixels, strict=True)
-            if math.isfinite(u) and math.isfinite(v)
-        ]
-    return "\n".join([*lines, ""])
-
-
-def _count(path: Path, line: int, column: str, cell: str, number: int) -> int:
-    text = cell.strip()
-    if not (text.isascii() and text.isdecimal() and int(text) < number):
-        message = f"found {text[:40]!r}, expected a whole number from 0 to {number - 1}."
-        refuse(path, message, "Check which board of the measurement it is, and count from 0.", line, column)
-    return int(text)
-
 
 _FEWEST = 3
 _BLURRED = 3.0
@@ -109,27 +41,14 @@ class ImagesSettings(Settings):
     10.png); with several cameras ``{camera: FOLDER}``. ``poses`` is a CSV file of joint angles, perhaps with a column
     ``image`` that names the file; for an arm ``flange_pose`` a table of base_T_flange (12 or 16 numbers a row, m), or
     columns x, y, z and qw, qx, qy, qz; or the settings of a reader, ``{type: pose_csv, path: FILE, euler: ...}``.
-    ``corners`` is a CSV file of corners that stands for the images; with ``folder`` it is written. Poses of an arm
-    with joints give their angles; ``first`` says about where they are in the first pose.
+    ``corners`` is where the records are written with the corners that were found, as the reader ``csv`` reads them.
+    Poses of an arm with joints give their angles; ``first`` says about where they are in the first pose.
     """
 
     poses: InputPath | dict[str, Any]
-    folder: InputPath | dict[str, InputPath] | None = None
-    corners: InputPath | dict[str, InputPath] | None = None
+    folder: InputPath | dict[str, InputPath]
+    corners: InputPath | None = None
     first: dict[str, Angle] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _some_images(self) -> ImagesSettings:
-        if self.folder is None and self.corners is None:
-            raise ValueError("found neither folder nor corners, expected the images, or the corners found in them")
-        return self
-
-
-@runtime_checkable
-class SeesBoards(Protocol):
-    """A measurement whose channels ``u_K`` and ``v_K`` are the points of its boards."""
-
-    boards: Sequence[Board]
 
 
 @dataclass(frozen=True)
@@ -144,7 +63,6 @@ class View:
     size: tuple[int, int] | None = None
     blur: float = float("nan")
     sha256: str = ""
-    path: str = ""
     oblique: float = float("nan")
 
 
@@ -164,7 +82,7 @@ class ImagesReader:
             DataError: a file is refused, poses and images differ in number, or fewer than three images are left.
             PluginError: OpenCV is not there.
         """
-        cameras = {name: tuple(m.boards) for name, m in request.measurements.items() if sees_boards(m)}
+        cameras = {name: tuple(boards) for name, m in request.measurements.items() if (boards := boards_of(m))}
         if not cameras:
             message = "found no measurement that sees boards, expected one for the images."
             raise DataError(message, hint="Add a measurement of type camera.")
@@ -180,46 +98,39 @@ class ImagesReader:
             request.report((number + done) / len(cameras))
 
         for number, (name, boards) in enumerate(cameras.items()):
-            views = _taken_once(as_the_others(self._views(name, boards, len(cameras), partial(of_all, number))))
-            place = str(_own(self._settings.folder or self._settings.corners, name, len(cameras)))
-            chosen = _matched(dataset, views, place, count)
+            folder = _own(self._settings.folder, name, len(cameras))
+            views = _taken_once(as_the_others(_views(folder, boards, partial(of_all, number))))
+            chosen = _matched(dataset, views, str(folder), count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
             dataset = _with_corners(dataset, name, [views[image] for image in chosen], known)
             ids = tuple(chosen)
         blind = set.intersection(*(set(fault) for fault in faults))  # of several cameras one will do
-        return _left(replace(dataset, ids=ids), {i: "; ".join(fault[i] for fault in faults) for i in blind})
-
-    def _views(self, camera: str, boards: tuple[Board, ...], cameras: int, report: Report) -> dict[str, View]:
-        """What each image of a camera says, by its name."""
-        folder = _own(self._settings.folder, camera, cameras)
-        corners = _own(self._settings.corners, camera, cameras)
-        if folder is None:
-            assert corners is not None
-            given, digest = read_corners(corners, boards)
-            return {name: View(pixels, _too_few(pixels), sha256=digest) for name, pixels in given.items()}
-        paths = _images_in(folder)
-        made = Automatic().map(partial(look, boards), paths, report)
-        views = {path.name: replace(view, path=str(path)) for path, view in zip(paths, made, strict=True)}
-        if corners is not None:
-            seen = {name: view.corners for name, view in _of_one_size(views).items() if not view.fault}
-            write_over({corners: corners_text(seen, boards).encode()})
-        return views
+        dataset = _left(replace(dataset, ids=ids), {i: "; ".join(fault[i] for fault in faults) for i in blind})
+        if self._settings.corners is not None:
+            write_csv(self._settings.corners, dataset, request.channels)
+        return dataset
 
 
-def sees_boards(measurement: object) -> TypeGuard[SeesBoards]:
-    return isinstance(measurement, SeesBoards)
+def boards_of(measurement: object) -> Sequence[Board]:
+    """The boards whose points are the channels ``u_K`` and ``v_K`` of a measurement; none if it is no camera."""
+    return getattr(measurement, "boards", ())
 
 
-def _own(places: Path | Mapping[str, Path] | None, camera: str, cameras: int) -> Path | None:
-    if isinstance(places, Mapping):
-        if camera not in places:
-            message = f"found {', '.join(places)}, expected the camera {camera} as well."
-            raise DataError(message, hint=f"Write {{{camera}: PATH}} in the data section.")
+def _own(places: Path | Mapping[str, Path], camera: str, cameras: int) -> Path:
+    if isinstance(places, Path) and cameras == 1:
+        return places
+    if isinstance(places, Mapping) and camera in places:
         return places[camera]
-    if places is not None and cameras > 1:
-        message = f"found one path for {cameras} cameras, expected one for each."
-        raise DataError(message, hint=f"Write {{{camera}: PATH, ...}} in the data section.")
-    return places
+    found = ", ".join(places) if isinstance(places, Mapping) else f"one folder for {cameras} cameras"
+    hint = f"Write folder: {{{camera}: PATH, ...}} in the data section."
+    raise DataError(f"found {found}, expected a folder for the camera {camera} as well.", hint=hint)
+
+
+def _views(folder: Path, boards: tuple[Board, ...], report: Report) -> dict[str, View]:
+    """What each image of a camera says, by its name."""
+    paths = _images_in(folder)
+    made = Automatic().map(partial(look, boards), paths, report)
+    return {path.name: view for path, view in zip(paths, made, strict=True)}
 
 
 def look(boards: Sequence[Board], path: Path) -> View:
@@ -263,48 +174,31 @@ def _images_in(folder: Path) -> list[Path]:
     return sorted(paths, key=natural)
 
 
-def _too_few(pixels: Array) -> str:
-    count = int(np.isfinite(pixels).all(axis=1).sum())
-    return "" if count >= 4 else f"it has {count} corners, at least 4 are needed"
-
-
 def as_the_others(views: Mapping[str, View]) -> dict[str, View]:
-    """Views, with a fault where the image differs from the others in size or is far less sharp."""
-    return _sharp_enough(_of_one_size(views))
+    """Views, with a fault where the image differs from most in size (another camera took it) or is far less sharp."""
+    sizes = [view.size for view in views.values() if view.size]
+    usual = max(sizes, key=sizes.count, default=None)
+    blur = float(np.nanmedian([view.blur for view in views.values()] + [np.inf]))
+
+    def judged(view: View) -> View:
+        if usual and view.size and view.size != usual:
+            width, height = view.size
+            text = f"it is {width} x {height} px, the others are {usual[0]} x {usual[1]}"
+        elif not view.fault and view.blur > _BLURRED * blur:
+            text = f"it is blurred: edges are {2 * view.blur:.1f} px wide, {2 * blur:.1f} px in most images"
+        else:
+            return view
+        return replace(view, fault=text)
+
+    return {name: judged(view) for name, view in views.items()}
 
 
 def _taken_once(views: Mapping[str, View]) -> dict[str, View]:
     """Views, with a fault where an image is the very file that another is: the camera was not asked again."""
     first: dict[str, str] = {}
-    text = "it is the same image as {}"
     return {
-        name: replace(view, fault=text.format(first[view.sha256]))
-        if view.path and not view.fault and first.setdefault(view.sha256, name) != name
-        else view
-        for name, view in views.items()
-    }
-
-
-def _of_one_size(views: Mapping[str, View]) -> dict[str, View]:
-    """Views of images that are not as large as most say nothing: another camera took them, or another mode of it."""
-    sizes = [view.size for view in views.values() if view.size]
-    usual = max(sizes, key=sizes.count, default=None)
-    text = "it is {0} x {1} px, the others are {2} x {3}"
-    return {
-        name: replace(view, fault=text.format(*view.size, *usual))
-        if usual and view.size and view.size != usual
-        else view
-        for name, view in views.items()
-    }
-
-
-def _sharp_enough(views: Mapping[str, View]) -> dict[str, View]:
-    """Views that are far less sharp than most say nothing: the camera moved."""
-    usual = float(np.nanmedian([view.blur for view in views.values()] + [np.inf]))
-    text = "it is blurred: edges are {:.1f} px wide, {:.1f} px in most images"
-    return {
-        name: replace(view, fault=text.format(2 * view.blur, 2 * usual))
-        if not view.fault and view.blur > _BLURRED * usual
+        name: replace(view, fault=f"it is the same image as {first[view.sha256]}")
+        if not view.fault and first.setdefault(view.sha256, name) != name
         else view
         for name, view in views.items()
     }

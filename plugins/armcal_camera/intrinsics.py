@@ -14,8 +14,7 @@ import numpy as np
 import yaml
 from armcal.base.arrays import Array
 from armcal.base.settings import Settings, UnitOf
-from armcal.errors import DataError, Location
-from armcal.io.plain_files import input_bytes
+from armcal.io.plain_files import input_bytes, refuse
 from pydantic import Field
 
 from armcal_camera.board import or_file
@@ -30,7 +29,8 @@ _MOST_BYTES = 1024**2
 _FISHEYE = {"equidistant", "fisheye"}
 _PINHOLE = {"plumb_bob", "radtan", "none"}
 _MATRIX = ("camera_matrix", "cameraMatrix", "K", "M1")
-_DISTORTION = ("distortion_coefficients", "distCoeffs", "distortion", "D", "D1")
+_DISTORTION = ("distortion_coefficients", "distCoeffs", "distortion", "D", "D1", "distortion_coeffs")
+_HINT = "Give a camera_info YAML of ROS, an OpenCV YAML with camera_matrix, or a camchain of Kalibr."
 
 
 class IntrinsicsSettings(Settings):
@@ -62,48 +62,28 @@ def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
     try:
         content = yaml.load("\n".join(x for x in text.splitlines() if not x.startswith("%YAML")), _Loader)
     except yaml.YAMLError as fault:
-        raise _refused(path, f"it is not YAML ({fault}).") from fault
-    if isinstance(content, Mapping):
-        content = content.get("cam0", content)
-        for read in (_of_matrix, _of_kalibr):
-            made = read(content) if isinstance(content, Mapping) else None
-            if made is not None:
-                return _with_model(path, content, made)
-    raise _refused(path, "found no camera matrix in it.")
-
-
-def _of_matrix(content: Mapping[str, Any]) -> dict[str, Any] | None:
+        refuse(path, f"it is not YAML ({fault}).", _HINT)
+    content = content.get("cam0", content) if isinstance(content, Mapping) else {}
+    content = content if isinstance(content, Mapping) else {}
     matrix = next((_numbers(content[key]) for key in _MATRIX if key in content), [])
-    if len(matrix) != 9:
-        return None
-    distortion = next((_numbers(content[key]) for key in _DISTORTION if key in content), [])
-    size = [content.get("image_width"), content.get("image_height")]
-    return {"numbers": (matrix[0], matrix[4], matrix[2], matrix[5]), "distortion": distortion, "image": size}
-
-
-def _of_kalibr(content: Mapping[str, Any]) -> dict[str, Any] | None:
-    intrinsics = _numbers(content.get("intrinsics"))
-    if len(intrinsics) != 4 or content.get("camera_model", "pinhole") != "pinhole":
-        return None
-    distortion, size = _numbers(content.get("distortion_coeffs")), _numbers(content.get("resolution"))
-    return {"numbers": tuple(intrinsics), "distortion": distortion, "image": size}
-
-
-def _with_model(path: str | Path, content: Mapping[str, Any], made: Mapping[str, Any]) -> IntrinsicsSettings:
-    stated, distortion = str(content.get("distortion_model", "plumb_bob")).lower(), tuple(made["distortion"])
+    numbers = [matrix[i] for i in (0, 4, 2, 5)] if len(matrix) == 9 else []
+    if not numbers and content.get("camera_model", "pinhole") == "pinhole":  # as Kalibr writes them
+        numbers = _numbers(content.get("intrinsics"))
+    if len(numbers) != 4:
+        refuse(path, "found no camera matrix in it.", _HINT)
+    distortion = tuple(next((_numbers(content[key]) for key in _DISTORTION if key in content), []))
+    size = _numbers([content.get("image_width"), content.get("image_height")]) or _numbers(content.get("resolution"))
+    stated = str(content.get("distortion_model", "plumb_bob")).lower()
     if stated == "rational_polynomial" and not any(distortion[5:]):  # k4 to k6 are zero
         stated, distortion = "plumb_bob", distortion[:5]
     if stated not in _FISHEYE | _PINHOLE:
         known = ", ".join(sorted(_FISHEYE | _PINHOLE))
-        raise _refused(path, f"found the distortion model {stated!r}, expected one of {known}.")
-    size = made["image"]
-    known_size = len(size) == 2 and all(isinstance(x, int | float) and x > 0 for x in size)
-    numbers = {key: x / 1000 for key, x in zip(("fx", "fy", "cx", "cy"), made["numbers"], strict=True)}
+        refuse(path, f"found the distortion model {stated!r}, expected one of {known}.", _HINT)
     return IntrinsicsSettings.si(
-        **numbers,
+        **{key: x / 1000 for key, x in zip(("fx", "fy", "cx", "cy"), numbers, strict=True)},
         distortion=distortion,
         model="fisheye" if stated in _FISHEYE else "pinhole",
-        image=tuple(x / 1000 for x in size) if known_size else None,
+        image=tuple(x / 1000 for x in size) if len(size) == 2 and min(size) > 0 else None,
     )
 
 
@@ -114,11 +94,6 @@ def _numbers(value: Any) -> list[float]:
         return []
     flat = [x for row in entries for x in (row if isinstance(row, Sequence) else [row])]
     return [float(x) for x in flat if isinstance(x, int | float)]
-
-
-def _refused(path: str | Path, what: str) -> DataError:
-    hint = "Give a camera_info YAML of ROS, an OpenCV YAML with camera_matrix, or a camchain of Kalibr."
-    return DataError(f"{what}", where=Location(str(path)), hint=hint)
 
 
 IntrinsicsOrFile: TypeAlias = Annotated[IntrinsicsSettings, or_file(read_intrinsics)]
@@ -133,10 +108,10 @@ def pinhole(x: Any, y: Any, distortion: Any) -> tuple[Any, Any]:
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-def fisheye(x: Any, y: Any, distortion: Any, atan: Any = ca.atan, sqrt: Any = ca.sqrt) -> tuple[Any, Any]:
+def fisheye(x: Any, y: Any, distortion: Any) -> tuple[Any, Any]:
     """Normalised coordinates of a lens whose image grows with the angle to its axis (k1 to k4). [Kannala2006]"""
-    radius = sqrt(x * x + y * y + _NO_ANGLE)
-    angle = atan(radius)
+    radius = ca.sqrt(x * x + y * y + _NO_ANGLE)
+    angle = ca.atan(radius)
     t2 = angle * angle
     k = [distortion[i] for i in range(4)]
     ratio = angle * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))) / radius
@@ -144,15 +119,7 @@ def fisheye(x: Any, y: Any, distortion: Any, atan: Any = ca.atan, sqrt: Any = ca
 
 
 def projected(lens: str, point: Any, focal: Any, centre: Any, distortion: Any) -> Any:
-    """Where a point in the camera's frame (3x1, m; in front of the camera) appears (2x1), as an expression.
-
-    Args:
-        lens: ``pinhole`` or ``fisheye``.
-        point: in the camera's frame.
-        focal: fx, fy.
-        centre: cx, cy.
-        distortion: coefficients in the order of ``DISTORTION``.
-    """
+    """Where a point in the camera's frame (3x1, m; in front of the camera) appears (2x1), as an expression."""
     distort = pinhole if lens == "pinhole" else fisheye
     x, y = distort(point[0] / point[2], point[1] / point[2], distortion)
     return ca.vertcat(focal[0] * x + centre[0], focal[1] * y + centre[1])

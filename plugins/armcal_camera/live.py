@@ -18,7 +18,7 @@ from pydantic import BeforeValidator
 from typing_extensions import override
 
 from armcal_camera.images import MOST_BYTES, is_image, opencv
-from armcal_camera.images_reader import View, as_the_others, corner_channels, look_at, sees_boards
+from armcal_camera.images_reader import View, as_the_others, boards_of, corner_channels, look_at
 
 _WAITING = 5  # So many images a driver may hold back: they are older than the moment of asking
 _PERIOD_S, _PATIENCE_S = 0.2, 2.0
@@ -67,7 +67,7 @@ class Camera(LiveCamera):
 
     @override
     def open(self, clock: Clock, measurements: Mapping[str, Measurement]) -> None:
-        cameras = {name: m for name, m in measurements.items() if sees_boards(m)}
+        cameras = {name: m for name, m in measurements.items() if boards_of(m)}
         named = self._settings.measurement
         if named not in cameras and (named is not None or len(cameras) != 1):
             message = f"found the cameras {', '.join(cameras) or 'none'} among the measurements, expected "
@@ -76,7 +76,7 @@ class Camera(LiveCamera):
                 message, hint="Add a measurement of type camera, or name one: camera: {measurement: NAME}."
             )
         self.measurement = named or next(iter(cameras))
-        self._camera = cameras[self.measurement]
+        self._boards = boards_of(cameras[self.measurement])
         self._channels = measurements[self.measurement].channels()
         cv2, self._clock = opencv(), clock
         if self._folder is not None:
@@ -110,7 +110,7 @@ class Camera(LiveCamera):
             return nothing
         grey = image if image.ndim == 2 else opencv().cvtColor(image, opencv().COLOR_BGR2GRAY)
         content = opencv().imencode(".png", grey)[1].tobytes()
-        return self._shot(look_at(self._camera.boards, content, "the image"), content, ".png", "the image")
+        return self._shot(look_at(self._boards, content, "the image"), content, ".png", "the image")
 
     @override
     def close(self) -> None:
@@ -139,7 +139,7 @@ class Camera(LiveCamera):
             content = input_bytes(path, MOST_BYTES, "an image")
         except (OSError, DataError):
             return None
-        view = look_at(self._camera.boards, content, path.name)
+        view = look_at(self._boards, content, path.name)
         if view.size is None and now < self._arriving[path.name][1] + _PATIENCE_S:
             return None  # no image yet: it may be cut off
         self._seen.add(path.name)

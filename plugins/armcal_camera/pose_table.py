@@ -39,6 +39,8 @@ from armcal.measure.tables import is_number, may_be_cut, whole_rows
 from armcal.plugins import discover
 from scipy.spatial.transform import Rotation
 
+FLANGE = ("x", "y", "z", "rz", "ry", "rx")
+"""Joints of an arm whose flange's pose is read: base_T_flange turns by Rz(rz) Ry(ry) Rx(rx)."""
 _STILL = (0.0, 0.0, 0.0)
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _STARTS = 96
@@ -56,7 +58,7 @@ class FlangePose:
 
     Settings: ClassVar[type[FlangePoseSettings]] = FlangePoseSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {}
-    joint_names: tuple[str, ...] = ("x", "y", "z", "rz", "ry", "rx")
+    joint_names: tuple[str, ...] = FLANGE
 
     def __init__(self, settings: FlangePoseSettings) -> None:
         self._settings = settings
@@ -74,13 +76,8 @@ class FlangePose:
 def recovered_joints(arm: Arm, poses: Array, near: Array) -> tuple[Array, Array]:
     """Commands (n x N; rad or m) at which the nominal arm is in these poses, and how many postures each has (N).
 
-    Args:
-        arm: whose nominal model it is, effects and springs left out.
-        poses: base_T_tool (N x 4 x 4, m).
-        near: about where the joints are in the first pose (n; rad or m).
-
-    Returns:
-        Commands, NaN where no posture within the joints' limits reaches a pose; and the numbers of postures.
+    Poses are base_T_tool (N x 4 x 4, m); ``near`` is about where the joints are in the first one (n; rad or m). NaN
+    where no posture within the joints' limits reaches a pose.
     """
     nominal = nominal_arm(arm, Parameters(tuple(arm.parameters())), Environment(_STILL), Options())
     targets = nominal.targets(poses[:, :3, 3], poses[:, :3, :3])
@@ -111,8 +108,6 @@ def _shortest(options: list[Array], near: Array) -> Array:
     return commands
 
 
-FLANGE = ("x", "y", "z", "rz", "ry", "rx")
-"""Joints of an arm whose flange's pose is read: base_T_flange turns by Rz(rz) Ry(ry) Rx(rx)."""
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _LONGEST_STEP_S = 0.2
 _MAX_BYTES = 256 * 1024**2
@@ -136,34 +131,26 @@ class _FlangeReading:
         return (*(Channel(name, "length") for name in "xyz"), *(Channel(name, DIMENSIONLESS) for name in _QUATERNION))
 
 
-@dataclass(frozen=True)
-class _Posed:
-    """An arm whose tool's pose is read, and about where its joints are in the first pose, by name."""
-
-    arm: Arm
-    first: Mapping[str, float]
-
-    def in_joints(self, dataset: Dataset, places: Array, turns: Rotation) -> Dataset:
-        """Records (N) with the joints at which the tool is in these poses (3 x N, m); those without any set aside."""
-        names = [f"{self.arm.name}.{name}" for name in self.arm.commanded]
-        if tuple(self.arm.commanded) == FLANGE:
-            rows = [*places, *np.unwrap(turns.as_euler("ZYX"), axis=0).T]
-            return _with(dataset, names, rows)
-        tools = np.tile(np.eye(4), (len(dataset), 1, 1))
-        tools[:, :3, :3], tools[:, :3, 3] = turns.as_matrix(), places.T
-        unknown = sorted(set(self.first) - set(self.arm.commanded))
-        if unknown:
-            have = ", ".join(self.arm.commanded)
-            raise DataError(f"data.first: found {', '.join(unknown)}, expected joints of the arm: {have}.")
-        near = np.array([self.first.get(name, 0.0) for name in self.arm.commanded])
-        commands, postures = recovered_joints(self.arm, tools, near)
-        text = (
-            "joint angles are recovered from poses by the nominal arm: of up to "
-            f"{int(postures.max(initial=0))} postures a pose the ones that move the joints least. "
-            "Check them, or give first: {JOINT: ANGLE} of the first pose and the joints' limits in the model."
-        )
-        unreached = dict.fromkeys(map(int, np.flatnonzero(~np.isfinite(commands[0]))), _UNREACHED)
-        return warned(_with(dataset, names, [*commands]).without(unreached), text)
+def _in_joints(dataset: Dataset, arm: Arm, first: Mapping[str, float], places: Array, turns: Rotation) -> Dataset:
+    """Records (N) with the joints at which the tool is in these poses (3 x N, m); those without any set aside."""
+    names = [f"{arm.name}.{name}" for name in arm.commanded]
+    if tuple(arm.commanded) == FLANGE:
+        return _with(dataset, names, [*places, *np.unwrap(turns.as_euler("ZYX"), axis=0).T])
+    tools = np.tile(np.eye(4), (len(dataset), 1, 1))
+    tools[:, :3, :3], tools[:, :3, 3] = turns.as_matrix(), places.T
+    unknown = sorted(set(first) - set(arm.commanded))
+    if unknown:
+        have = ", ".join(arm.commanded)
+        raise DataError(f"data.first: found {', '.join(unknown)}, expected joints of the arm: {have}.")
+    near = np.array([first.get(name, 0.0) for name in arm.commanded])
+    commands, postures = recovered_joints(arm, tools, near)
+    text = (
+        "joint angles are recovered from poses by the nominal arm: of up to "
+        f"{int(postures.max(initial=0))} postures a pose the ones that move the joints least. "
+        "Check them, or give first: {JOINT: ANGLE} of the first pose and the joints' limits in the model."
+    )
+    unreached = dict.fromkeys(map(int, np.flatnonzero(~np.isfinite(commands[0]))), _UNREACHED)
+    return warned(_with(dataset, names, [*commands]).without(unreached), text)
 
 
 def _with(dataset: Dataset, names: Sequence[str], rows: Sequence[Array]) -> Dataset:
@@ -174,15 +161,10 @@ def _with(dataset: Dataset, names: Sequence[str], rows: Sequence[Array]) -> Data
 def read_poses(
     poses: Path | dict[str, Any], request: ReadRequest, cameras: tuple[str, ...], first: Mapping[str, float]
 ) -> Dataset:
-    """The records of a file of poses, without what the cameras read.
+    """The records of a file of poses, or of the settings of a reader, without what the cameras read.
 
-    Of an arm with joints, poses are those of its nominal tool, and give its joint angles (``recovered_joints``).
-
-    Args:
-        poses: the file, or the settings of a reader (``type: csv``, ``type: pose_csv``).
-        request: what is asked for.
-        cameras: instances whose channels the file has not.
-        first: about where joints are in the first pose, by name (rad or m); empty if nothing is known.
+    Of an arm with joints, poses are those of its nominal tool, and give its joint angles (``recovered_joints``);
+    ``first`` says about where these are in the first pose, by name (rad or m).
 
     Raises:
         DataError: with file, line and column.
@@ -194,30 +176,27 @@ def read_poses(
     rest = {name: m for name, m in request.measurements.items() if name not in cameras}
     request = ReadRequest(request.arms, rest, channels)
     arm = next(iter(request.arms.values())) if len(request.arms) == 1 else None
-    posed = None if arm is None else _Posed(arm, first)
-    if isinstance(poses, Path):
+    settings: dict[str, Any] = {"type": "csv", "path": str(poses)} if isinstance(poses, Path) else dict(poses)
+    if isinstance(poses, Path) and arm is not None:
         header = _first_line(poses)
-        if posed is not None and header and all(is_number(cell) for cell in header):
-            return _table(poses, posed, request)
-        settings: dict[str, Any] = {"type": "csv", "path": str(poses)}
-        if posed is not None and set(_QUATERNION) <= set(header):
-            quaternion = {"columns": _QUATERNION, "order": "wxyz"}
-            settings = {"type": "pose_csv", "path": str(poses), "quaternion": quaternion}
-        elif posed is not None:
-            _refuse_angles_of_pose(poses, header, posed.arm)
-    else:
-        settings = dict(poses)
-    if posed is not None and settings.get("type") == "pose_csv":
-        return _with_rates(_flange_poses(settings, posed, request), rates)
-    return _with_rates(_reader(settings).read(request), rates)
+        if header and all(is_number(cell) for cell in header):
+            return _table(poses, arm, first, request)
+        if set(_QUATERNION) <= set(header):
+            settings |= {"type": "pose_csv", "quaternion": {"columns": _QUATERNION, "order": "wxyz"}}
+        else:
+            _refuse_angles_of_pose(poses, header, arm)
+    kind = str(settings.pop("type", "csv"))
+    component = discover().find("reader", kind).load()
+    reader = component(component.Settings.model_validate(settings))
+    if arm is not None and kind == "pose_csv":
+        return _with_rates(_flange_poses(reader, arm, first, request), rates)
+    return _with_rates(reader.read(request), rates)
 
 
 def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
     """Rates of joints (rad/s or m/s) that the file has not, from the times of its rows.
 
-    Raises:
-        DataError: there are no times, or rows are too far apart in time to say how fast a joint was; not where only
-            the verdict would read it.
+    Times that do not say how fast a joint was are refused, but not where only the verdict would read it.
     """
     missing = [w for w in rates if not dataset.has(w.channel)]
     if not missing:
@@ -240,12 +219,6 @@ def _with_rates(dataset: Dataset, rates: Sequence[RequestedChannel]) -> Dataset:
     return _with(dataset, [w.channel for w in missing], rows)
 
 
-def _reader(settings: dict[str, Any]) -> Any:
-    component = discover().find("reader", str(settings.get("type", "csv"))).load()
-    given = {key: value for key, value in settings.items() if key != "type"}
-    return component(component.Settings.model_validate(given))
-
-
 def _first_line(path: Path) -> list[str]:
     text = text_of(input_bytes(path, _MAX_BYTES, "a file of poses"), path, "Save it as text in UTF-8.")
     lines = (line for line in text.splitlines() if line.strip() and not line.startswith("#"))
@@ -253,11 +226,7 @@ def _first_line(path: Path) -> list[str]:
 
 
 def _refuse_angles_of_pose(path: Path, header: Sequence[str], arm: Arm) -> None:
-    """Columns of a place and of three turns, where joint angles are expected: conventions of turns differ.
-
-    Raises:
-        DataError: the file has them, and not the joints of the arm.
-    """
+    """Refuse columns of a place and of three turns where joint angles are expected: conventions of turns differ."""
     names = {(split_suffix(name) or (name,))[0].lower(): name for name in header}
     turns = next((three for three in _TURNS if names.keys() >= {*three, "x", "y", "z"}), None)
     if turns is None or names.keys() >= {name.lower() for name in arm.commanded}:
@@ -274,21 +243,20 @@ def _refuse_angles_of_pose(path: Path, header: Sequence[str], arm: Arm) -> None:
     )
 
 
-def _flange_poses(settings: dict[str, Any], posed: _Posed, request: ReadRequest) -> Dataset:
+def _flange_poses(reader: Any, arm: Arm, first: Mapping[str, float], request: ReadRequest) -> Dataset:
     """What a reader of poses makes of the file, as joints."""
-    arm = posed.arm
     reading: Any = _FlangeReading()
     others = tuple(w for w in request.channels if not w.channel.startswith(f"{arm.name}."))
     own = tuple(
         RequestedChannel(f"{_INSTANCE}.{c.name}", (c.name,), c.dimension, True, parts=(_INSTANCE,))
         for c in reading.channels()
     )
-    dataset = _reader(settings).read(ReadRequest({}, {_INSTANCE: reading}, (*others, *own)))
-    values = {name: dataset.column(f"{_INSTANCE}.{name}") for name in ("x", "y", "z", *_QUATERNION)}
-    turns = Rotation.from_quat(np.stack([values[name] for name in ("qx", "qy", "qz", "qw")], axis=1))
+    dataset = reader.read(ReadRequest({}, {_INSTANCE: reading}, (*others, *own)))
+    places, turns = (
+        dataset.stacked([f"{_INSTANCE}.{name}" for name in names]) for names in ("xyz", ("qx", "qy", "qz", "qw"))
+    )
     kept = {name: numbers for name, numbers in dataset.channels.items() if not name.startswith(f"{_INSTANCE}.")}
-    places = np.stack([values[name] for name in "xyz"])
-    return posed.in_joints(replace(dataset, channels=kept), places, turns)
+    return _in_joints(replace(dataset, channels=kept), arm, first, places, Rotation.from_quat(turns.T))
 
 
 def _rows(text: str) -> list[tuple[int, list[str]]]:
@@ -300,7 +268,7 @@ def _rows(text: str) -> list[tuple[int, list[str]]]:
     return [(rows[i][0], [cell for _, cells in rows[i : i + 4] for cell in cells]) for i in range(0, len(rows), 4)]
 
 
-def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
+def _table(path: Path, arm: Arm, first: Mapping[str, float], request: ReadRequest) -> Dataset:
     """base_T_flange in metres, row by row: 12 or 16 numbers a line, or a matrix in four lines of four."""
     content = input_bytes(path, _MAX_BYTES, "a table of flange poses")
     rows, matrices, lines = _rows(content.decode("utf-8-sig")), [], []
@@ -318,5 +286,4 @@ def _table(path: Path, posed: _Posed, request: ReadRequest) -> Dataset:
         lines.append(line)
     poses = np.array(matrices)
     bare = Dataset(tuple(map(str, lines)), {}, rows=tuple(lines), source=str(path))
-    dataset = posed.in_joints(bare, poses[:, :, 3].T, Rotation.from_matrix(poses[:, :, :3]))
-    return read_as(dataset, request)
+    return read_as(_in_joints(bare, arm, first, poses[:, :, 3].T, Rotation.from_matrix(poses[:, :, :3])), request)

@@ -13,9 +13,9 @@ from armcal.errors import ConfigError
 from numpy.typing import NDArray
 
 from armcal_camera.board import Board, dark_rectangles, outline
-from armcal_camera.hand_eye import pose_matrix
 from armcal_camera.images import Grey, opencv
 from armcal_camera.intrinsics import DISTORTION, normalised
+from armcal_camera.start import pose_matrix
 
 _SAMPLES = 4  # along each side of a pixel
 _COARSE_PX = 4
@@ -40,11 +40,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Exposure:
-    """What makes an image imperfect, and its grey values.
-
-    Attributes:
-        dark, white, background: grey values.
-    """
+    """What makes an image imperfect, and its grey values."""
 
     blur: float = 0.5  # standard deviation (px), beyond that of the pixels' own size
     noise: float = 0.0  # standard deviation (grey values)
@@ -56,14 +52,7 @@ class Exposure:
 
 
 def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, int], exposure: Exposure) -> Grey:
-    """The image of boards.
-
-    Args:
-        placed: each board with camera_T_board (4 x 4, m), all of it in front of the camera; later ones cover others.
-        lens: of the camera.
-        size: width and height (px).
-        exposure: blur, light and noise.
-    """
+    """The image (width and height in px) of boards, each with camera_T_board (4 x 4, m); later ones cover others."""
     cv2 = opencv()
     rays = _fine_rays(lens, size)
     fine = np.full(rays.shape[:2], exposure.background, np.float32)

@@ -26,10 +26,8 @@ Clock = Literal["header", "receive"]
 
 
 class Topic(NamedTuple):
-    """A topic: its name, and its messages' type (``sensor_msgs/msg/JointState``)."""
-
     name: str
-    type: str
+    type: str  # of its messages (``sensor_msgs/msg/JointState``)
 
 
 class TopicSettings(Settings):
@@ -40,16 +38,11 @@ class TopicSettings(Settings):
 
 
 class Stamps:
-    """Times of one topic's messages, in order; those that cannot be are counted.
-
-    Attributes:
-        count: of messages.
-        latest: the last time (s since 1970), None before the first.
-    """
+    """Times of one topic's messages, in order; those that cannot be are counted."""
 
     def __init__(self, topic: str, clock: Clock) -> None:
         self.topic, self.count = topic, 0
-        self.latest: float | None = None
+        self._latest: float | None = None  # the last time (s since 1970)
         self._clock = clock
         self._faults = Counter[str]()
         self._delays = array("d")
@@ -58,11 +51,11 @@ class Stamps:
         """Seconds since 1970 (arguments in ns); None where it is missing, repeated or before an earlier one."""
         self.count += 1
         chosen = stamp if self._clock == "header" else received
-        time, latest = chosen / 1e9, self.latest
+        time, latest = chosen / 1e9, self._latest
         if not chosen or (latest is not None and time <= latest):
             self._faults[_ZERO if not chosen else _SAME if time == latest else _EARLIER] += 1
             return None
-        self.latest = time
+        self._latest = time
         if len(self._delays) < _MOST_DELAYS:
             self._delays.append((received - chosen) / 1e9)
         return time
@@ -102,21 +95,14 @@ _RECOVER = (
 
 
 class Message(NamedTuple):
-    """A message: its topic, when the recorder received it (ns since 1970), its bytes, and what rosbags made of them."""
-
     topic: Topic
-    received: int
+    received: int  # by the recorder (ns since 1970)
     data: bytes
-    content: Any
+    content: Any  # what rosbags made of it
 
 
 class Bag:
-    """A recording, whose messages are read from its files by ``rosbags`` whenever they are asked for.
-
-    Attributes:
-        path: the folder or the file.
-        topics: how many messages each has; complete once messages were asked for, as all that follows.
-        remarks: what of it is missing or could not be read, sentences.
+    """A recording (folder or file), whose messages are read from its files by ``rosbags`` whenever they are asked for.
 
     Raises:
         DataError: it is none.
@@ -124,8 +110,8 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.topics = Counter[Topic]()
-        self.remarks: list[str] = []
+        self.topics = Counter[Topic]()  # how many messages each has; complete once messages were asked for
+        self.remarks: list[str] = []  # what of it is missing or could not be read, sentences
         self._files = [path]
         if path.is_dir():
             self._look_inside()

@@ -459,7 +459,7 @@ class Rosbag2Reader:
         channels = self._joint_channels(request)
         joints = JointLog(tuple(channels.values()), slides, s.joints, s.still)
         logs = [MeasuredLog(name, own) for name, own in s.measurements.items()]
-        every = (joints, *logs)
+        every: tuple[JointLog | MeasuredLog, ...] = (joints, *logs)
         for topic, received, data, content in bag.messages(lambda topic: any(log.reads(topic) for log in every)):
             digest.update(data)
             for log in every:

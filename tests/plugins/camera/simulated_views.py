@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import armcal
 import casadi as ca
 import numpy as np
+import pytest
 import yaml
 from armcal.arm.model import forward
 from armcal.base.arrays import Array
@@ -15,6 +17,7 @@ from armcal.estimate.estimator import Estimate
 from armcal.measure.csv_writer import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import RunContext, Stopwatch, fitted, prepare
+from armcal_camera.images_reader import View
 from scipy.spatial.transform import Rotation
 
 ARM = Path(__file__).resolve().parents[3] / "configs" / "camera" / "arm.yaml"
@@ -105,3 +108,9 @@ def of(estimate: Estimate, name: str) -> tuple[Array, Array]:
     places = [entries.index(f"{name}_{axis}") for axis in "xyz"]
     rows = [free.index(i) for i in places]
     return estimate.values[places], estimate.covariance[np.ix_(rows, rows)]
+
+
+def stand_for_images(monkeypatch: pytest.MonkeyPatch, corners: Mapping[str, Array]) -> None:
+    """Corners (K x 2, px) that the reader ``images`` finds, by the names of images that are not there."""
+    views = {name: View(np.asarray(pixels), sha256=name) for name, pixels in corners.items()}
+    monkeypatch.setattr("armcal_camera.images_reader._views", lambda *_: views)

@@ -15,9 +15,17 @@ from armcal.diagnose.residual_structure import structure
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
-from armcal_camera.images_reader import corners_text
 
-from tests.plugins.camera.simulated_views import MIDDLE, base_T, configured, estimated, numbers, pose, simulated
+from tests.plugins.camera.simulated_views import (
+    MIDDLE,
+    base_T,
+    configured,
+    estimated,
+    numbers,
+    pose,
+    simulated,
+    stand_for_images,
+)
 
 STEP_S, LATE_S, IMAGES, EVERY = 0.04, 0.1, 30, 12
 
@@ -42,19 +50,23 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     seen = experiment.simulator().simulate(replace(experiment.simulation_request, poses=poses))
     rows = np.stack([[seen.column(f"camera.{axis}_{k}") for axis in "uv"] for k in range(20)])
     corners = {f"{i}.png": to_unit(rows[:, :, i], "px") for i in range(IMAGES)}
-    boards = experiment.system.measurements["camera"].boards  # type: ignore[attr-defined]
-    (folder / "corners.csv").write_text(corners_text(corners, boards))
+    np.savez(folder / "corners.npz", **corners)
     lines = ["image,time_s," + ",".join(f"q{i}_rad" for i in range(1, 7))]
     for number, (time, row) in enumerate(zip(times, swept(times - LATE_S).T, strict=True)):
         image = f"{number // EVERY}.png" if number % EVERY == EVERY // 2 else ""
         lines.append(",".join([image, repr(float(time)), *(repr(float(q)) for q in row)]))
     (folder / "joints.csv").write_text("\n".join([*lines, ""]))
     content = yaml.safe_load((folder / "config.yaml").read_text())
-    content["data"] = {"type": "images", "corners": "corners.csv", "poses": "joints.csv"}
+    content["data"] = {"type": "images", "folder": ".", "poses": "joints.csv"}
     content["arms"]["arm"]["effects"] = {"clock": {"type": "delay"}}
     content["parameters"]["free"].append("arm.clock.delay")
     (folder / "late.yaml").write_text(yaml.safe_dump(content))
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _corners(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_for_images(monkeypatch, dict(np.load(recorded / "corners.npz")))
 
 
 @pytest.mark.slow

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from armcal.base.arrays import Array
 from armcal.measure.instrument import Reading
-from armcal_camera.camera import Setup, first_guess
-from armcal_camera.hand_eye import board_pose, hand_eye, intrinsics, open_motion
-from armcal_camera.intrinsics import DISTORTION
+from armcal_camera.board import Chessboard, Tag
+from armcal_camera.camera import Camera, CameraSettings
+from armcal_camera.intrinsics import DISTORTION, IntrinsicsSettings
+from armcal_camera.start import board_pose, first_guess, hand_eye, intrinsics, open_motion
 from scipy.spatial.transform import Rotation
 
 BOARD = np.array([[25e-3 * x, 25e-3 * y] for y in range(6) for x in range(9)])
@@ -90,8 +91,11 @@ def test_few_wrong_poses_decide_nothing() -> None:
 
 def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
     """Each board is judged by its own fullest view: a tag never has as many points as a chessboard."""
-    random, corners = np.random.default_rng(8), np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    boards, x, tag = (BOARD, 0.04 * corners), pose(random), pose(random, 0.2, 0.05)
+    random = np.random.default_rng(8)
+    sheets = (Chessboard.si(type="chessboard", columns=9, rows=6, square=0.025), Tag.si(type="tag", id=0, tag=0.04))
+    stated = IntrinsicsSettings.si(fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+    camera = Camera(CameraSettings.si(noise=1e-4, boards=sheets, intrinsics=stated), ["arm"])
+    boards, x, tag = [sheet.points[:, :2] for sheet in sheets], pose(random), pose(random, 0.2, 0.05)
     tools, image, ahead = np.array([pose(random, 0.1, 0.05) for _ in range(8)]), np.zeros((8, 58, 2)), np.eye(4)
     ahead[:3, 3] = (-0.1, -0.1, 0.8)
     y = tools[0] @ x @ ahead
@@ -101,9 +105,6 @@ def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
             there = points @ seen[:3, :2].T + seen[:3, 3]
             image[i, part] = there[:, :2] / there[:, 2:]
     names = ("board1", "board2")
-    setup = Setup(
-        names, tuple(np.c_[points, np.zeros(len(points))] for points in boards), "pinhole", True, ("tool", "base")
-    )
     place = {f"{n}_{a}": np.zeros(1) for n in ("camera", *names) for a in "xyz"}
     turns = {f"{n}_rotation": np.array([1.0, 0, 0, 0]) for n in ("camera", *names)}
     lens = {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0, "board_scale": 1.0, **dict.fromkeys(DISTORTION["pinhole"], 0.0)}
@@ -111,7 +112,7 @@ def test_a_small_board_beside_a_large_one_has_its_pose_found() -> None:
     read = {f"{axis}_{k}": image[:, k, j] for k in range(58) for j, axis in enumerate("uv")}
     frames = {"tool": tools, "base": np.tile(np.eye(4), (8, 1, 1))}
     proposal = first_guess(
-        setup, Reading(frames, read, values, frozenset({*place, *turns}), tuple(map(str, range(len(frames["tool"])))))
+        camera, Reading(frames, read, values, frozenset({*place, *turns}), tuple(map(str, range(len(frames["tool"])))))
     )
     for name, expected in (("camera", x), ("board1", y), ("board2", y @ tag)):
         assert np.allclose([proposal.values[f"{name}_{a}"][0] for a in "xyz"], expected[:3, 3], atol=1e-5), name

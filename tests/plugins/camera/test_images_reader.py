@@ -19,12 +19,14 @@ from armcal.measure.reader import ReadRequest, RequestedChannel
 pytest.importorskip("cv2")
 import cv2
 from armcal_camera.board import Board, Chessboard
-from armcal_camera.images_reader import ImagesReader, ImagesSettings, corners_text, read_corners
+from armcal_camera.images_reader import ImagesReader, ImagesSettings
 from armcal_camera.pose_table import FLANGE
 from armcal_camera.render import Exposure, Lens, render
+from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from scipy.spatial.transform import Rotation
 
-from tests.plugins.camera.sheets import CHARUCO, SIZE, facing, projected
+from tests.plugins.camera.sheets import SIZE, facing, projected
+from tests.plugins.camera.simulated_views import stand_for_images
 
 BOARD = Chessboard.si(type="chessboard", columns=5, rows=4, square=0.04)
 LENS = Lens((600.0, 600.0), (320.0, 240.0))
@@ -173,53 +175,20 @@ def test_a_folder_without_images_is_refused(folder: Path, change: Callable[[Path
         read(folder=folder, poses=poses)
 
 
-@pytest.mark.slow
-def test_corners_are_written_and_stand_for_the_images(folder: Path) -> None:
+def test_corners_are_written_as_records_that_the_reader_csv_reads(folder: Path) -> None:
     corners = folder / "corners.csv"
     first = read(folder=folder, poses=folder / "poses.csv", corners=corners)
-    again = read(poses=folder / "poses.csv", corners=corners)
+    again = CsvReader(CsvSettings(path=corners)).read(request_of())
     assert first.ids == again.ids
     for name, values in first.channels.items():
-        np.testing.assert_allclose(values, again.channels[name], atol=6e-9)
-
-
-def test_corners_of_several_boards_read_back(tmp_path: Path) -> None:
-    boards = (BOARD, CHARUCO)
-    pixels = np.random.default_rng(2).uniform(0, 4000, (60, 2)).round(5)
-    pixels[[3, 25]] = np.nan
-    path = tmp_path / "corners.csv"
-    path.write_text(corners_text({"a.png": pixels, "b, c.png": pixels[::-1]}, boards))
-    corners, _ = read_corners(path, boards)
-    np.testing.assert_allclose(corners["a.png"], pixels, atol=6e-6)
-    np.testing.assert_allclose(corners["b, c.png"], pixels[::-1], atol=6e-6)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("image,point,u_px\n", r":1.*expected v_px as well"),
-        (
-            "image,point,u_px,v_px\na,0,1,2\na,20,1,2\n",
-            r":3.*point.*found '20', expected a whole number from 0 to 19",
-        ),
-        ("image,point,u_px,v_px\na,0,1,2\na,0,1,2\n", r":3.*the point 0 of this image again"),
-        ("image,point,u_px,v_px\na,0,1,x\n", r":2.*v_px.*found 'x', expected a number"),
-        ("image,point,u_px,v_px\na,0,1\n", r":2.*found 3 cells, expected 4"),
-        ("image,point,u_px,v_px\n", "no corners"),
-    ],
-)
-def test_a_file_of_corners_is_refused_with_its_line(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "corners.csv"
-    path.write_text(text)
-    with pytest.raises(DataError, match=message):
-        read_corners(path, (BOARD,))
+        np.testing.assert_allclose(values, again.channels[name], rtol=1e-15)
 
 
 POSES = [Rotation.from_euler("ZYX", (0.3 * i, -0.2, 3.0 + 0.1 * i)) for i in range(COUNT)]
 
 
 @pytest.mark.parametrize("form", ["matrix", "three rows", "four lines", "quaternion", "euler"])
-def test_flange_poses_become_coordinates(tmp_path: Path, form: str) -> None:
+def test_flange_poses_become_coordinates(tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     path, settings = tmp_path / "flange.txt", None
     matrices = [np.hstack([turn.as_matrix(), [[0.1 * i], [0.2], [0.5]]]) for i, turn in enumerate(POSES)]
     if form in ("matrix", "three rows"):
@@ -239,9 +208,8 @@ def test_flange_poses_become_coordinates(tmp_path: Path, form: str) -> None:
         euler = {"columns": ["a", "b", "c"], "order": "XYZ", "unit": "deg"}
         settings = {"type": "pose_csv", "path": str(path), "euler": euler}
     path.write_text(text)
-    corners = tmp_path / "corners.csv"
-    corners.write_text(corners_text({f"{i}.png": truth(i) for i in range(COUNT)}, (BOARD,)))
-    dataset = read(request_of(FLANGE), corners=corners, poses=settings or path)
+    stand_for_images(monkeypatch, {f"{i}.png": truth(i) for i in range(COUNT)})
+    dataset = read(request_of(FLANGE), folder=tmp_path, poses=settings or path)
     values = {name: dataset.column(f"arm.{name}") for name in FLANGE}
     np.testing.assert_allclose(values["x"], 0.1 * np.arange(COUNT), atol=1e-9)
     turns = Rotation.from_euler("ZYX", np.stack([values["rz"], values["ry"], values["rx"]], axis=1))
@@ -282,12 +250,8 @@ def test_flange_poses_cut_in_the_last_number_are_refused(folder: Path) -> None:
         read(request_of(FLANGE), folder=folder, poses=path)
 
 
-@pytest.mark.slow
-def test_without_opencv_corners_are_read_and_images_are_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = read(folder=folder, poses=folder / "poses.csv", corners=folder / "corners.csv")
+def test_without_opencv_a_sentence_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    again = read(poses=folder / "poses.csv", corners=folder / "corners.csv")
-    np.testing.assert_allclose(first.column("camera.u_7"), again.column("camera.u_7"), atol=6e-9)
     with pytest.raises(PluginError, match=r"pip install 'armcal\[camera\]'"):
         read(folder=folder, poses=folder / "poses.csv")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from armcal.base.arrays import Array
 from armcal.errors import ProblemError
-from armcal_camera.mixed_up import require_form, require_one_board
+from armcal_camera.start import require_form, require_one_board
 from scipy.spatial.transform import Rotation
 
 COUNT = 16

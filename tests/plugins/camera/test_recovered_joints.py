@@ -13,6 +13,8 @@ from armcal.errors import DataError
 from armcal.run.experiment import Experiment
 from armcal_camera.pose_table import recovered_joints
 
+from tests.plugins.camera.simulated_views import stand_for_images
+
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
 START = np.deg2rad([10.0, -85.0, 95.0, -100.0, -80.0, 15.0])
 
@@ -59,14 +61,16 @@ def test_a_pose_out_of_reach_has_no_joints(arm: Arm, path: Array) -> None:
 
 
 @pytest.mark.slow
-def test_images_with_poses_of_an_arm_with_joints(arm: Arm, path: Array, tmp_path: Path) -> None:
+def test_images_with_poses_of_an_arm_with_joints(
+    arm: Arm, path: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     tools = tools_at(arm, path)
     (tmp_path / "poses.txt").write_text("\n".join(" ".join(f"{x:.12f}" for x in tool[:3].ravel()) for tool in tools))
-    corners = [f"{i}.png,{k},{100 + 10 * (k % 9) + i},{200 + 10 * (k // 9)}" for i in range(8) for k in range(54)]
-    (tmp_path / "corners.csv").write_text("\n".join(["image,point,u_px,v_px", *corners]))
+    places = np.array([(100 + 10 * (k % 9), 200 + 10 * (k // 9)) for k in range(54)])
+    stand_for_images(monkeypatch, {f"{i}.png": places + np.array([i, 0.0]) for i in range(8)})
     (tmp_path / "config.yaml").write_text(
         DEMO.parent.joinpath("arm.yaml").read_text()
-        + "data:\n  type: images\n  corners: corners.csv\n  poses: poses.txt\n"
+        + "data:\n  type: images\n  folder: .\n  poses: poses.txt\n"
         + "  first: {q1: 10 deg, q2: -85 deg, q3: 95 deg, q4: -100 deg, q5: -80 deg, q6: 15 deg}\n"
     )
     dataset = Experiment.load(tmp_path / "config.yaml").read()
