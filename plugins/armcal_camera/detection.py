@@ -15,7 +15,7 @@ it is more accurate than a point's gradient, and its width says how sharp the im
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -35,16 +35,12 @@ _ROUGHEST = 0.25
 _NEAR = 1e-9
 
 
-@dataclass(frozen=True)
-class Refined:
+class Refined(NamedTuple):
     """Corners after the fit."""
 
     corners: Array  # (N x 2, px); NaN where the surroundings are not those of a corner
     blur: Array  # standard deviation of the blur across the edges (N, px)
     crossing: Array  # q3, whose sign says which quadrants are dark (N, grey values); NaN as well
-
-
-_FIELDS = ("corners", "blur", "crossing")
 
 
 _Patches = tuple[Array, Array, Array, Array]
@@ -61,7 +57,7 @@ def refine(image: Array | Grey, corners: Array, scale: Array, reach: float) -> R
         _refined(image, corners[i : i + _AT_ONCE], scale[i : i + _AT_ONCE], reach)
         for i in range(0, len(corners), _AT_ONCE)
     ]
-    return Refined(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS))
+    return Refined(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _refined(image: Array | Grey, corners: Array, scale: Array, reach: float) -> Refined:

@@ -141,8 +141,25 @@ class HandEyeExporter(_CameraExporter):
         place, quaternion = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
         there, turned = dict(zip("xyz", place, strict=True)), dict(zip("xyzw", quaternion, strict=True))
         stem = request.out.rpartition("/")[2].rpartition(".")[0] or "camera"
-        first, second = self._easy_handeye(stem, on_hand, tool_frame, there, turned)
-        first["standard_deviation_m"] = {axis: instrument.deviations.get(f"camera_{axis}") for axis in "xyz"}
+        s = self._settings
+        own = {
+            "robot_base_frame": s.base_frame,
+            "robot_effector_frame": tool_frame,
+            "tracking_base_frame": s.camera_frame,
+            "tracking_marker_frame": s.board_frame,
+        }
+        # easy_handeye takes parameters for keyword arguments, of which namespace has no default; easy_handeye2 takes
+        # all of its file for the fields of a message: neither may have others
+        first: dict[str, Any] = {
+            "parameters": {"namespace": stem, "eye_on_hand": on_hand, **own},
+            "transformation": {**there, **{f"q{axis}": x for axis, x in turned.items()}},
+            "standard_deviation_m": {axis: instrument.deviations.get(f"camera_{axis}") for axis in "xyz"},
+        }
+        kind = "eye_in_hand" if on_hand else "eye_on_base"
+        second = {
+            "parameters": {"name": stem, "calibration_type": kind, **own, "freehand_robot_movement": True},
+            "transform": {"translation": there, "rotation": turned},
+        }
         numbers = " ".join(f"--{k} {x:.9g}" for k, x in first["transformation"].items())
         command = f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id {parent} --child-frame-id {child}"
         title = f"# {parent} to {child}, in metres: the camera {name}.\n"
@@ -153,31 +170,6 @@ class HandEyeExporter(_CameraExporter):
             "~/.ros2/easy_handeye2/calibrations."
         )
         return Exported(text.encode(), 7, companions=companions, remarks=(f"To publish it: {command}", places))
-
-    def _easy_handeye(
-        self, name: str, on_hand: bool, tool_frame: str, there: Mapping[str, float], turned: Mapping[str, float]
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Files of easy_handeye and of easy_handeye2.
-
-        The first takes ``parameters`` for keyword arguments, of which ``namespace`` has no default; the second takes
-        all of it for the fields of a message. Neither may have others.
-        """
-        frames = {
-            "robot_base_frame": self._settings.base_frame,
-            "robot_effector_frame": tool_frame,
-            "tracking_base_frame": self._settings.camera_frame,
-            "tracking_marker_frame": self._settings.board_frame,
-        }
-        kind = "eye_in_hand" if on_hand else "eye_on_base"
-        first = {
-            "parameters": {"namespace": name, "eye_on_hand": on_hand, **frames},
-            "transformation": {**there, **{f"q{axis}": x for axis, x in turned.items()}},
-        }
-        second = {
-            "parameters": {"name": name, "calibration_type": kind, **frames, "freehand_robot_movement": True},
-            "transform": {"translation": dict(there), "rotation": dict(turned)},
-        }
-        return first, second
 
 
 def _intrinsics(instrument: Instrument, camera: Camera) -> tuple[Array, list[float], tuple[int, int] | None]:

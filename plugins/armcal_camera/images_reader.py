@@ -121,9 +121,9 @@ def _own(places: Path | Mapping[str, Path], camera: str, cameras: int) -> Path:
         return places
     if isinstance(places, Mapping) and camera in places:
         return places[camera]
-    found = ", ".join(places) if isinstance(places, Mapping) else f"one folder for {cameras} cameras"
+    stated = ", ".join(places) if isinstance(places, Mapping) else f"one folder for {cameras} cameras"
     hint = f"Write folder: {{{camera}: PATH, ...}} in the data section."
-    raise DataError(f"found {found}, expected a folder for the camera {camera} as well.", hint=hint)
+    raise DataError(f"found {stated}, expected a folder for the camera {camera} as well.", hint=hint)
 
 
 def _views(folder: Path, boards: tuple[Board, ...], report: Report) -> dict[str, View]:

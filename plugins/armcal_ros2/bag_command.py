@@ -96,17 +96,17 @@ def survey(bag: Bag) -> Survey:
     return Survey(topics, joints, [*bag.remarks, *remarks])
 
 
-def _data_section(path: Path, found: Survey) -> dict[str, Any]:
+def _data_section(path: Path, content: Survey) -> dict[str, Any]:
     """One that would read it; empty without joint states."""
-    if not found.joints:
+    if not content.joints:
         return {}
-    topic, log = max(found.joints.items(), key=lambda entry: len(entry[1].rests))
+    topic, log = max(content.joints.items(), key=lambda entry: len(entry[1].rests))
     section: dict[str, Any] = {"type": "rosbag2", "path": str(path), "joints": {"topic": topic}}
     numbered = {f"q{i}": name for i, name in enumerate(log.names, start=1)}
     if set(numbered) != set(log.names):
         section["joints"]["names"] = numbered
     measured: dict[str, dict[str, str]] = {}
-    for name, summary in found.topics.items():
+    for name, summary in content.topics.items():
         if summary.type not in MEASURED or name.endswith("_static") or not summary.measured:
             continue
         instance = f"tracker{len(measured) + 1}" if measured else "tracker"
@@ -127,9 +127,9 @@ def bag() -> None:
 @speaking
 def info(console: Console, path: Path) -> None:
     """Topics, times and rests of the recording PATH, and a data section for a configuration."""
-    found = survey(Bag(path))
-    topics, joints, remarks = found
-    data = _data_section(path, found)
+    content = survey(Bag(path))
+    topics, joints, remarks = content
+    data = _data_section(path, content)
     console.result(
         {
             "topics": {name: vars(topic) for name, topic in topics.items()},
@@ -170,9 +170,9 @@ def images(
 ) -> None:
     """Take one image of each rest out of the recording PATH, for the reader images."""
     recording = Bag(path)
-    found = survey(recording)
-    seen = _only(path, [name for name, own in found.topics.items() if own.type in IMAGES], topic, "images", "--topic")
-    log = found.joints[_only(path, list(found.joints), joints, "joint states", "--joints")]
+    content = survey(recording)
+    seen = _only(path, [name for name, own in content.topics.items() if own.type in IMAGES], topic, "images", "--topic")
+    log = content.joints[_only(path, list(content.joints), joints, "joint states", "--joints")]
     rests = [rest for rest in log.rests if rest.end - rest.begin >= RestSettings().window]
     table, information = out / "joints.csv", out / "camera_info.yaml"
     require_new([table, information])
@@ -182,7 +182,7 @@ def images(
         suffix, picture = picture_of(message, seen)
         written[place] = f"rest{place + 1:04d}{suffix}"
         write_new({out / written[place]: picture})
-    remarks = [*found.remarks, *stamps.check(str(path))]
+    remarks = [*content.remarks, *stamps.check(str(path))]
     if not written:
         refuse(path, f"found no image of {seen} in {len(rests)} rests.", " ".join(remarks) or "Record again.")
     if len(written) < len(rests):

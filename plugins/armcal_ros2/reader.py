@@ -566,13 +566,13 @@ class Rosbag2Reader:
         """By the times of receipt the clocks differ, or a point moves while the joints rest, as if they did."""
         apart = joints.stamps.delay - log.stamps.delay
         moves = [bool(one.fault) for one in seen if one.samples >= _FEWEST_SAMPLES]
-        found = f"stamps of {log.settings.topic} are about {apart:.3g} s ahead of those of {joints.stamps.topic}"
+        clocks = f"stamps of {log.settings.topic} are about {apart:.3g} s ahead of those of {joints.stamps.topic}"
         if abs(apart - log.settings.clock_offset) > _CLOCKS_APART_S:
-            return [f"{found}, by the times of receipt. Set clock_offset_s: {apart:.3f} for {log.instance}."]
+            return [f"{clocks}, by the times of receipt. Set clock_offset_s: {apart:.3f} for {log.instance}."]
         if 2 * sum(moves) <= len(moves):
             return []
         text = f"{log.instance} moves in {sum(moves)} of {len(moves)} rests of the joints. It is on another arm, or not"
-        text += f" in m; or its clock is another: by the times of receipt {found}"
+        text += f" in m; or its clock is another: by the times of receipt {clocks}"
         return [f"{text}, set clock_offset_s: {apart:.3f} for {log.instance}."]
 
     def _measured(self, name: str, request: ReadRequest, seen: Sequence[_Seen]) -> dict[str, Array]:
