@@ -34,11 +34,7 @@ _Id = Annotated[int, Field(ge=0)]
 
 
 def tags_in(family: str) -> int:
-    """How many tags an AprilTag family (``36h11``) or a dictionary of OpenCV (``DICT_5X5_100``) has.
-
-    Raises:
-        ValueError: no such family.
-    """
+    """How many tags an AprilTag family (``36h11``) or a dictionary of OpenCV (``DICT_5X5_100``) has."""
     if family in FAMILIES:
         return FAMILIES[family]
     match = _DICTIONARY.fullmatch(family)
@@ -255,20 +251,12 @@ class BoardFile(Settings):
 
 
 def read_board(path: Any) -> Board:
-    """The board of a file that ``armcal board`` wrote.
-
-    Raises:
-        ConfigError: the file is not there, or is not one; with its line.
-    """
+    """The board of a file that ``armcal board`` wrote."""
     return validate(BoardFile, load_config(path)).board
 
 
 def require_distinct(boards: Sequence[Board]) -> None:
-    """That boards of one measurement can be distinguished in an image.
-
-    Raises:
-        ValueError: two of them share tags, or look alike.
-    """
+    """Refuse boards of one measurement that cannot be distinguished in an image."""
     for index, board in enumerate(boards):
         for other in boards[:index]:
             own, others = board.layout, other.layout
@@ -283,21 +271,13 @@ def require_distinct(boards: Sequence[Board]) -> None:
 
 
 def dictionary(family: str) -> Any:
-    """OpenCV's dictionary of a family of tags.
-
-    Raises:
-        PluginError: OpenCV is not there.
-    """
+    """OpenCV's dictionary of a family of tags."""
     aruco = opencv().aruco
     return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_APRILTAG_{family}" if family in FAMILIES else family))
 
 
 def dark_rectangles(board: Board) -> Array:
-    """The dark parts, in the board's frame (N x 4: smallest x and y, largest x and y; m).
-
-    Raises:
-        PluginError: it has tags, and OpenCV, which knows them, is not there.
-    """
+    """The dark parts, in the board's frame (N x 4: smallest x and y, largest x and y; m)."""
     parts = [_squares(board), *_tags(board)]
     ends = np.concatenate(parts)
     return np.hstack([np.minimum(ends[:, :2], ends[:, 2:]), np.maximum(ends[:, :2], ends[:, 2:])])

@@ -89,12 +89,7 @@ def board(console: Console, kind: str, paper: str, out: Path, force: bool, **siz
 
 
 def pages_of(board: Board, paper: str) -> dict[str, bytes]:
-    """The page of a board as PDF and SVG, upright or lying, whichever has room; to scale, with a ruler.
-
-    Raises:
-        ValueError: the paper is too small; says what fits.
-        PluginError: the board has tags, and OpenCV is not there; or matplotlib is not there.
-    """
+    """The page of a board as PDF and SVG, upright or lying, whichever has room; to scale, with a ruler."""
     width, height = page_of(board, paper)
     figure = library("matplotlib.figure", "printing a board").Figure((width / _INCH_MM, height / _INCH_MM))
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))  # a unit is a millimetre

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -14,15 +14,170 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.domains import Interval
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import PoseSettings, pose_transform
+from armcal.base.quaternions import quaternion_of
 from armcal.base.se3 import identity
 from armcal.measure.instrument import InstrumentSettings, PointInstrument, Proposal, Reading, spread_points
 from armcal.measure.measurement import Channel, Mistake
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
-from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, projected
+from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, normalised, projected
 from armcal_camera.render import rendered_records
-from armcal_camera.start import FEWEST_POINTS, first_guess
+from armcal_camera.start import (
+    FEWEST_POINTS,
+    board_pose,
+    hand_eye,
+    intrinsics,
+    open_motion,
+    pose_matrix,
+    require_board_axes,
+    require_form,
+    require_one_board,
+)
+
+_INTRINSICS = ("fx", "fy", "cx", "cy")
+_FEWEST_VIEWS, _MOST_VIEWS = 3, 30
+
+
+class _View(NamedTuple):
+    """A board in a record: its points (n x 2, m) and where they appear (n x 2, thousands of pixels)."""
+
+    record: int
+    board: int
+    points: Array
+    image: Array
+
+
+def first_guess(camera: Camera, reading: Reading) -> Proposal:
+    """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``.
+
+    With A the frame of the camera as seen from that of the boards, A camera_pose = board_pose camera_T_board^-1 in
+    every record: one equation wherever camera and boards are. Boards whose place is held or another camera's do where
+    the motion leaves it open.
+
+    Raises:
+        ProblemError: the images cannot be of what is stated.
+    """
+    own, free = dict(reading.values), reading.free
+    views = _views(camera, reading)
+    require_board_axes([(v.points, v.image) for v in views if len(v.points) == len(camera.used[v.board])])
+    if free & set(_INTRINSICS) and camera.settings.intrinsics is None:
+        own |= _intrinsics(views, free)
+    poses, names = _poses(camera, views, own), camera.board_names
+    proposed = {name: own[name] for name in _INTRINSICS if name in free}
+    camera_frame, board_frame = camera.camera_frame, camera.board_frame
+    moved = np.asarray(np.linalg.inv(reading.frames[board_frame]) @ reading.frames[camera_frame])
+    known = [not free & set(_place(name)) for name in names]
+    is_open = open_motion(moved, camera_frame)
+    if camera_frame == board_frame:
+        is_open = (
+            f"camera and boards are both on the frame {camera_frame} and never move against one another: where they "
+            "are is not determined.",
+            "Name a camera that moves against the same boards in boards_of, or state board_poses and hold them.",
+        )
+    for own_poses in poses if is_open is None else ():
+        if len(own_poses):
+            hand, board_ = moved[list(own_poses)], np.array(list(own_poses.values()))
+            require_form(hand, board_)
+            require_one_board(hand, board_, [reading.ids[i] for i in own_poses])
+    if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
+        return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
+    boards = [board for board in zip(names, poses, known, strict=True) if board[1]]
+    boards.sort(key=lambda board: (is_open is not None and not board[2], -len(board[1])))
+    return Proposal({**proposed, **_places(boards, moved, own, free)})
+
+
+def _places(
+    boards: Sequence[tuple[str, dict[int, Array], bool]], moved: Array, own: Mapping[str, Array], free: frozenset[str]
+) -> dict[str, Array]:
+    """Places of the camera and of boards (name, camera_T_board by record, whether its own place is known)."""
+    proposed, camera_pose = dict[str, Array](), None
+    for name, poses, is_known in boards:
+        a, b = moved[list(poses)], np.array(list(poses.values()))
+        if camera_pose is None and _placed("camera", free):
+            solved = hand_eye(a, np.linalg.inv(b))
+            if solved is None and not is_known:
+                continue
+            every = np.linalg.inv(a) @ pose_matrix(name, own) @ np.linalg.inv(b)
+            camera_pose = every[_middle(every)] if solved is None else solved.x
+            board_pose_ = pose_matrix(name, own) if solved is None else solved.y
+            proposed |= _pose_values("camera", camera_pose)
+        else:
+            every = a @ (pose_matrix("camera", own) if camera_pose is None else camera_pose) @ b
+            board_pose_ = every[_middle(every)]
+        if _placed(name, free):
+            proposed |= _pose_values(name, board_pose_)
+    return proposed
+
+
+def _place(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}_{part}" for part in ("x", "y", "z", "rotation"))
+
+
+def _placed(name: str, free: frozenset[str]) -> bool:
+    return set(_place(name)) <= free
+
+
+def _views(camera: Camera, reading: Reading) -> list[_View]:
+    """Every board in every record of which enough points are there."""
+    scale = float(reading.values["board_scale"][0])
+    image = np.array(list(reading.channels.values())).reshape(len(camera.points), 2, -1)
+    views, start = [], 0
+    for number, (board, used) in enumerate(zip(camera.boards, camera.used, strict=True)):
+        part, points = image[start : start + len(used)], scale * board.points[used, :2]
+        start += len(points)
+        for record in range(image.shape[2]):
+            there = np.isfinite(part[:, :, record]).all(axis=1)
+            if there.sum() >= FEWEST_POINTS and np.linalg.matrix_rank(np.c_[points[there], np.ones(there.sum())]) == 3:
+                views.append(_View(record, number, points[there], part[there, :, record]))
+    return views
+
+
+def _fullest(views: Sequence[_View]) -> list[_View]:
+    """Those with at least half as many points as their board's fullest: few say little of a pose or of a lens."""
+    most: dict[int, int] = {}
+    for view in views:
+        most[view.board] = max(len(view.points), most.get(view.board, 0))
+    return [view for view in views if 2 * len(view.points) >= most[view.board]]
+
+
+def _intrinsics(views: list[_View], free: frozenset[str]) -> dict[str, Array]:
+    """Those that views determine; where they do not, a lens of ordinary width about the middle."""
+    whole = np.concatenate([view.image for view in views]) if views else np.array([[0.5, 0.5]])
+    middle = (whole.min(axis=0) + whole.max(axis=0)) / 2
+    size = float(np.max(whole.max(axis=0) - whole.min(axis=0)))
+    full = [(view.points, view.image - middle) for view in _fullest(views)]
+    full = full[:: max(1, len(full) // _MOST_VIEWS)]
+    solved = intrinsics(full, size) if len(full) >= _FEWEST_VIEWS else None
+    off = np.inf if solved is None else max(abs(solved[2]), abs(solved[3]))
+    if solved is None or off > size or not 0.2 * size < min(solved[:2]) <= max(solved[:2]) < 50 * size:
+        solved = (1.2 * size, 1.2 * size, 0.0, 0.0)
+    start = dict(zip(_INTRINSICS, (solved[0], solved[1], *(middle + solved[2:])), strict=True))
+    return {name: np.array([value]) for name, value in start.items() if name in free}
+
+
+def _poses(camera: Camera, views: list[_View], values: Mapping[str, Array]) -> list[dict[int, Array]]:
+    """camera_T_board of each board, by record (4 x 4, m)."""
+    focal, centre = (np.concatenate([values[a], values[b]]) for a, b in (("fx", "fy"), ("cx", "cy")))
+    lens = camera.settings.model
+    distortion = np.concatenate([values[name] for name in DISTORTION[lens]])
+    poses: list[dict[int, Array]] = [{} for _ in camera.boards]
+    for view in _fullest(views):
+        seen = normalised(lens, view.image.T, focal, centre, distortion).T
+        poses[view.board][view.record] = board_pose(view.points, seen)
+    return poses
+
+
+def _pose_values(name: str, pose: Array) -> dict[str, Array]:
+    place = {f"{name}_{axis}": pose[i : i + 1, 3] for i, axis in enumerate("xyz")}
+    return {**place, f"{name}_rotation": np.array(quaternion_of(pose[:3, :3]))}
+
+
+def _middle(poses: Array) -> int:
+    """Of poses that should be one (N x 4 x 4), the one nearest to the others."""
+    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
+    return int(np.argmin(np.median(apart, axis=1)))
+
 
 _PIXELS_SCALE, _DISTORTION_SCALE, _SCALE_SCALE, _BEND_SCALE_M = 0.01, 0.05, 0.01, 1e-3
 _NEAREST_M, _LEAST_FACING = 0.02, 0.3

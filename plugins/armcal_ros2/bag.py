@@ -18,8 +18,8 @@ IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _PURPOSE = "reading recordings of ROS 2"
 _MOST_DELAYS = 4096
-_ZERO, _SAME = "the stamp zero", "the stamp of the one before"
-_EARLIER = "a stamp before that of an earlier one"
+_ZERO, _SAME = "with the stamp zero", "with the stamp of the one before"
+_EARLIER = "with a stamp before that of an earlier one"
 _MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01})
 """A larger part of the messages, and times are not to be trusted."""
 Clock = Literal["header", "receive"]
@@ -44,7 +44,7 @@ class Stamps:
         self.topic, self.count = topic, 0
         self._latest: float | None = None  # the last time (s since 1970)
         self._clock = clock
-        self._faults = Counter[str]()
+        self.faults = Counter[str]()  # why messages are left out
         self._delays = array("d")
 
     def time(self, stamp: int, received: int) -> float | None:
@@ -53,7 +53,7 @@ class Stamps:
         chosen = stamp if self._clock == "header" else received
         time, latest = chosen / 1e9, self._latest
         if not chosen or (latest is not None and time <= latest):
-            self._faults[_ZERO if not chosen else _SAME if time == latest else _EARLIER] += 1
+            self.faults[_ZERO if not chosen else _SAME if time == latest else _EARLIER] += 1
             return None
         self._latest = time
         if len(self._delays) < _MOST_DELAYS:
@@ -71,12 +71,13 @@ class Stamps:
         Raises:
             DataError: stamps are zero, constant or backwards in too many messages.
         """
-        for cause, count in self._faults.items():
-            if count > max(_MOST[cause] * self.count, 1):
-                text = f"{count} of {self.count} messages of {self.topic} have {cause}, expected times of measurement."
+        for cause, most in _MOST.items():
+            if (count := self.faults[cause]) > max(most * self.count, 1):
+                what = cause.removeprefix("with ")
+                text = f"{count} of {self.count} messages of {self.topic} have {what}, expected times of measurement."
                 hint = f"Set stamps: receive for {self.topic}, or give each program that publishes a topic of its own."
                 refuse(place, text, hint)
-        listed = ", ".join(f"{count} with {cause}" for cause, count in self._faults.items())
+        listed = ", ".join(f"{count} {cause}" for cause, count in self.faults.most_common())
         return [f"of {self.count} messages of {self.topic} some were left out: {listed}."] if listed else []
 
 
@@ -92,13 +93,6 @@ _RECOVER = (
     "If its recorder was killed: mcap recover FILE.mcap -o NEW.mcap makes a whole file of what it wrote, ros2 bag "
     "reindex FOLDER the metadata.yaml."
 )
-
-
-class Message(NamedTuple):
-    topic: Topic
-    received: int  # by the recorder (ns since 1970)
-    data: bytes
-    content: Any  # what rosbags made of it
 
 
 class Bag:
@@ -121,8 +115,9 @@ class Bag:
             hint = "Convert it with rosbags-convert." if path.suffix == ".bag" else _EXPECTED
             refuse(path, f"found the ending {path.suffix or 'none'}, expected .mcap or .db3.", hint)
 
-    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[Message]:
-        """The messages of chosen topics, of each file by their time.
+    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[tuple[Topic, int, bytes, Any]]:
+        """The messages of chosen topics, of each file by their time: when they were received (ns since 1970), their
+        bytes, and what rosbags made of them.
 
         Raises:
             DataError: a file is no recording, or is cut off or damaged.
@@ -145,7 +140,7 @@ class Bag:
                         except Exception:  # damaged bytes or a type that is not standard
                             unread[topics[connection.id]] += 1
                             continue
-                        yield Message(topics[connection.id], received, bytes(data), content)
+                        yield topics[connection.id], received, bytes(data), content
             except Exception as fault:  # of damaged files rosbags has no one error
                 text = f"it is cut off, damaged or no recording, after {count} messages ({said(fault)})."
                 refuse(file, text, f"{_EXPECTED} {_RECOVER}")

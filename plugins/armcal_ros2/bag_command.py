@@ -14,7 +14,6 @@ import yaml
 from armcal.cli.common import FILE, Console, speaking
 from armcal.errors import DataError
 from armcal.io.plain_files import refuse, require_new, write_new
-from numpy.typing import NDArray
 
 from armcal_ros2.bag import CAMERA_INFO, IMAGES, JOINT_STATE, Bag, Stamps, nanoseconds
 from armcal_ros2.reader import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
@@ -246,24 +245,19 @@ def _nearest(
         yield held[0], held[2]
 
 
-_LUMA = np.array([0.299, 0.587, 0.114])
 _MAGIC: Mapping[bytes, str] = MappingProxyType({b"\xff\xd8": ".jpg", b"\x89PNG": ".png"})
-_STEPS: Mapping[str, tuple[int, tuple[int, ...]]] = MappingProxyType(
-    {
-        "mono8": (1, (0,)),
-        "8uc1": (1, (0,)),
-        "rgb8": (3, (0, 1, 2)),
-        "bgr8": (3, (2, 1, 0)),
-        "8uc3": (3, (2, 1, 0)),
-        "rgba8": (4, (0, 1, 2)),
-        "bgra8": (4, (2, 1, 0)),
-        "yuv422_yuy2": (2, (0,)),
-        "yuyv": (2, (0,)),
-        "yuv422": (2, (1,)),
-        "uyvy": (2, (1,)),
-    }
-)
-"""Bytes of a pixel by encoding, and which of them are red, green and blue, or the brightness."""
+_LUMA: Mapping[str, float] = MappingProxyType({"r": 0.299, "g": 0.587, "b": 0.114, "y": 1.0, "_": 0.0})
+_LAYOUTS = {
+    "y": ("mono8", "8uc1"),
+    "rgb": ("rgb8",),
+    "bgr": ("bgr8", "8uc3"),
+    "rgb_": ("rgba8",),
+    "bgr_": ("bgra8",),
+    "y_": ("yuv422_yuy2", "yuyv"),
+    "_y": ("yuv422", "uyvy", "mono16", "16uc1"),
+}
+_ENCODINGS = MappingProxyType({name: layout for layout, names in _LAYOUTS.items() for name in names})
+"""The bytes of a pixel by encoding: red, green, blue, brightness, and what does not count."""
 
 
 def picture_of(message: Any, topic: str) -> tuple[str, bytes]:
@@ -279,23 +273,16 @@ def picture_of(message: Any, topic: str) -> tuple[str, bytes]:
         if suffix is None:
             refuse(topic, f"found images compressed as {message.format!r}, expected JPEG or PNG.", "Record others.")
         return suffix, content
-    rows = data.reshape(message.height, message.step)
-    encoding = message.encoding.lower()
-    if encoding in ("mono16", "16uc1"):
-        pixels = rows[:, : 2 * message.width].reshape(message.height, message.width, 2)
-        return ".pgm", _pgm(pixels[:, :, 0 if message.is_bigendian else 1])
-    if encoding not in _STEPS:
-        known = ", ".join(_STEPS)
-        refuse(topic, f"found images encoded as {message.encoding!r}, expected {known} or mono16.", "Record others.")
-    step, places = _STEPS[encoding]
-    pixels = rows[:, : step * message.width].reshape(message.height, message.width, step)[:, :, list(places)]
-    grey = pixels[:, :, 0] if len(places) == 1 else np.round(pixels @ _LUMA)
-    return ".pgm", _pgm(grey.astype(np.uint8))
-
-
-def _pgm(grey: NDArray[np.uint8]) -> bytes:
-    height, width = grey.shape
-    return f"P5\n{width} {height}\n255\n".encode() + np.ascontiguousarray(grey).tobytes()
+    layout = _ENCODINGS.get(message.encoding.lower())
+    if layout is None:
+        known = ", ".join(_ENCODINGS)
+        refuse(topic, f"found images encoded as {message.encoding!r}, expected one of {known}.", "Record others.")
+    if "16" in message.encoding and message.is_bigendian:
+        layout = layout[::-1]
+    rows = data.reshape(message.height, message.step)[:, : len(layout) * message.width]
+    weights = [_LUMA[part] for part in layout]
+    grey = np.round(rows.reshape(message.height, message.width, len(layout)) @ weights).astype(np.uint8)
+    return ".pgm", f"P5\n{message.width} {message.height}\n255\n".encode() + grey.tobytes()
 
 
 def _camera_info(message: Any) -> str:

@@ -30,6 +30,7 @@ from armcal_ros2.bag import JOINT_STATE, Bag, Stamps, Topic, TopicSettings, nano
 GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
 _THINNED_S = 0.01  # Joints are kept so far apart: 25 MB for an hour of seven of them
 _LARGEST = 1e6  # No joint stands so far away, in any unit
+_NO_POSITION = "whose positions are missing or not finite"
 _JUMP, _MOST_RETURNS = 20.0, 0.1
 """A larger part of messages that jump by so many spreads, to where the joints just were: two programs publish them."""
 
@@ -85,8 +86,7 @@ class JointLog:
         self._furthest: Array | None = None
         self._direction = np.zeros(len(self.names))
         self._before: list[Array] = []  # where the joints were last, and where before that, apart
-        self._returns = self._faulty = 0
-        self._lacking = Counter[str]()
+        self._returns = 0
         self._others = set[str]()
         self._stated = settings.topic
         self.topic = settings.topic  # if none was stated, the first that has joint states
@@ -110,13 +110,13 @@ class JointLog:
         places = self._places[names]
         if len(places) < len(self.names):
             if places:
-                self._lacking[next(name for name in self.names if name not in names)] += 1
+                self.stamps.faults[f"without {next(name for name in self.names if name not in names)}"] += 1
             return
         time = self.stamps.time(nanoseconds(message.header.stamp), received)
         if time is None:
             return
         if len(message.position) != len(names) or not (np.abs(row := message.position[places]) < _LARGEST).all():
-            self._faulty += 1
+            self.stamps.faults[_NO_POSITION] += 1
             return
         self._take(time, row * self._scale)
 
@@ -142,19 +142,13 @@ class JointLog:
             missing = f"joint {lacking[0]}" if lacking else "message with all joints of the arm"
             refuse(place, f"found no {missing} in {topic}; its joints are {', '.join(sorted(named)) or 'none'}.", hint)
         remarks = self.stamps.check(place)
-        if self._faulty == count:
+        if self.stamps.faults[_NO_POSITION] == count:
             hint = "Repair the driver, or record again."
             refuse(place, f"none of {count} messages of {topic} has a finite position for each joint.", hint)
         if self._returns > _MOST_RETURNS * count:
             text = f"the joints of {topic} jump to and fro between two sets of values in {self._returns} of {count}"
             hint = "Stop one of them, such as joint_state_publisher beside a controller, and record again."
             refuse(place, f"{text} messages: two programs publish it.", hint)
-        if self._lacking:
-            (name, some), *_ = self._lacking.most_common()
-            remarks.append(f"{some} messages of {topic} name some joints of the arm without {name}: left out.")
-        if self._faulty:
-            text = f"{self._faulty} of {count} messages of {topic} have positions that are missing or not finite"
-            remarks.append(f"{text}: left out.")
         pauses = np.diff(times)
         if (silent := pauses > self._still.window).any():
             longest = int(np.argmax(pauses))
@@ -275,7 +269,6 @@ class MeasuredLog:
         self._samples = array("d")  # 8 each: s, m, quaternion xyzw
         self._tree = _Tree()
         self._frames = Counter[str]()
-        self._faults = Counter[str]()
         self._moved_at: float | None = None
 
     def reads(self, topic: Topic) -> bool:
@@ -325,9 +318,6 @@ class MeasuredLog:
         remarks = self.stamps.check(where)
         if others:
             remarks.append(f"{others} messages of {s.topic} have other frames than {usual!r}.")
-        if self._faults:
-            faults = ", ".join(f"{some} whose {what}" for what, some in self._faults.most_common())
-            remarks.append(f"of {count} messages of {s.topic} some were left out: {faults}.")
         return remarks
 
     def seen(self, rests: Sequence[JointRest], still: RestSettings) -> list[_Seen]:
@@ -357,7 +347,7 @@ class MeasuredLog:
         for part in message.transforms:
             q = part.transform.rotation
             if not abs(math.hypot(q.x, q.y, q.z, q.w) - 1) <= _NORM_TOLERANCE:
-                self._faults["quaternion is not of length 1"] += 1
+                self.stamps.faults["whose quaternion is not of length 1"] += 1
                 continue
             at = (nanoseconds(part.header.stamp) if s.stamps == "header" else received) / 1e9
             pose, place, child = np.eye(4), part.transform.translation, part.child_frame_id.lstrip("/")
@@ -380,15 +370,16 @@ class MeasuredLog:
 
     def _take(self, time: float, position: Array, turn: Array | None) -> None:
         if not np.isfinite(position).all():
-            self._faults["position is not finite"] += 1
+            self.stamps.faults["whose position is not finite"] += 1
             return
         if turn is None:
             if self.settings.inverted:
-                self._faults["orientation is missing, so that they have no inverse"] += 1
+                self.stamps.faults["whose orientation is missing, so that they have no inverse"] += 1
                 return
             turn = np.full(4, np.nan)
         elif not abs((norm := float(np.linalg.norm(turn))) - 1) <= _NORM_TOLERANCE:
-            self._faults["quaternion is zero" if norm < _NORM_TOLERANCE else "quaternion is not of length 1"] += 1
+            what = "is zero" if norm < _NORM_TOLERANCE else "is not of length 1"
+            self.stamps.faults[f"whose quaternion {what}"] += 1
             return
         elif self.settings.inverted:
             inverse = Rotation.from_quat(turn).inv()

@@ -60,7 +60,9 @@ def test_exports_name_the_frame_that_carries_the_camera() -> None:
     numbers_ = {key: 0.0 for name in ("camera", "board") for key in numbers(name, np.eye(4))}
     numbers_ |= {"camera_rotation[w]": 1.0, "board_rotation[w]": 1.0, "fx": 1.0, "fy": 1.0, "cx": 0.5, "cy": 0.5}
     numbers_ |= dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), 0.0)
-    camera = SimpleNamespace(settings={"type": "camera", "frame": "row3"}, numbers=numbers_, deviations={})
+    board = {"type": "chessboard", "columns": 5, "rows": 4, "square_m": 0.04}
+    settings = {"type": "camera", "frame": "row3", "noise_px": 0.1, "board": board}
+    camera = SimpleNamespace(settings=settings, numbers=numbers_, deviations={})
     request = SimpleNamespace(instruments={"camera": camera}, out="where.yaml")
     where = HandEyeExporter(FramesSettings()).export(request)  # type: ignore[arg-type]
     assert yaml.safe_load(where.content)["parameters"]["robot_effector_frame"] == "row3"

@@ -7,9 +7,9 @@ import pytest
 from armcal.base.arrays import Array
 from armcal.measure.instrument import Reading
 from armcal_camera.board import Chessboard, Tag
-from armcal_camera.camera import Camera, CameraSettings
+from armcal_camera.camera import Camera, CameraSettings, first_guess
 from armcal_camera.intrinsics import DISTORTION, IntrinsicsSettings
-from armcal_camera.start import board_pose, first_guess, hand_eye, intrinsics, open_motion
+from armcal_camera.start import board_pose, hand_eye, intrinsics, open_motion
 from scipy.spatial.transform import Rotation
 
 BOARD = np.array([[25e-3 * x, 25e-3 * y] for y in range(6) for x in range(9)])
