@@ -161,7 +161,7 @@ def test_every_tool_that_is_pinned_is_declared_or_needed() -> None:
     names = {text.replace("[", ">").replace(";", ">").split(">")[0].split("=")[0].strip().lower() for text in declared}
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
-    indirect = {"clarabel", "dask", "distributed"}
+    indirect = {"clarabel"}
     assert pinned <= names | indirect
     assert {"figaroh", "roboticstoolbox-python", "smbus2"} >= names - pinned
 

@@ -16,7 +16,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, InputPath, Settings
 from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
-from armcal.io.parallel import Automatic, Report
+from armcal.io.parallel import Executor, Report
 from armcal.io.plain_files import input_bytes, refuse
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest
@@ -129,7 +129,7 @@ def _own(places: Path | Mapping[str, Path], camera: str, cameras: int) -> Path:
 def _views(folder: Path, boards: tuple[Board, ...], report: Report) -> dict[str, View]:
     """What each image of a camera says, by its name."""
     paths = _images_in(folder)
-    made = Automatic().map(partial(look, boards), paths, report)
+    made = Executor().map(partial(look, boards), paths, report)
     return {path.name: view for path, view in zip(paths, made, strict=True)}
 
 

@@ -29,7 +29,7 @@ from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
 from armcal.estimate.polish import bounded_step, polish
-from armcal.io.parallel import Executor, Sequential
+from armcal.io.parallel import Executor
 from armcal.io.signals import Interrupts
 from armcal.problem.problem import NormalEquations, PosedProblem, Problem
 from pydantic import Field
@@ -168,7 +168,7 @@ class IpoptEstimator:
     Settings: ClassVar[type[IpoptSettings]] = IpoptSettings
 
     def __init__(self, settings: IpoptSettings, executor: Executor | None = None) -> None:
-        self._settings, self._executor = settings, executor or Sequential()
+        self._settings, self._executor = settings, executor or Executor(1)
 
     def spread(self, executor: Executor) -> IpoptEstimator:
         return IpoptEstimator(self._settings, executor)
@@ -225,7 +225,7 @@ def _searched(settings: IpoptSettings, posed: Posed, start: Array) -> _Run:
         answer = solver(x0=start, lbx=lower, ubx=upper)
     stats = solver.stats()
     stopped = stats["return_status"] == "User_Requested_Stop"
-    if interrupts.came or (stopped and not (objective.stuck or watch.settled)):
+    if interrupts.finish or (stopped and not (objective.stuck or watch.settled)):
         raise KeyboardInterrupt  # CasADi keeps it to itself, and the next start would go on
     # IPOPT stays inside its bounds by a rounding error; the model's domain wants it exactly.
     x = np.clip(np.asarray(answer["x"]).ravel(), lower, upper)

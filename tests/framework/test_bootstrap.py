@@ -19,7 +19,7 @@ from armcal.estimate.uncertainty import (
     draw_weights,
     standard_error_of_mean,
 )
-from armcal.io.parallel import Workers
+from armcal.io.parallel import Executor
 from armcal.run.study import Change, change, simplest_good
 from click.testing import CliRunner
 
@@ -182,7 +182,7 @@ def test_the_same_seed_gives_the_same_refits_anywhere(lrm) -> None:
     settings = BootstrapSettings(bootstrap=6, seed=5)
     runs = [
         bootstrap(problem.with_records(records), experiment.estimator, found, settings, executor).values
-        for executor in (None, Workers("loky", 2))
+        for executor in (None, Executor(2))
     ]
     assert np.array_equal(*runs)
     other = settings.model_copy(update={"seed": 6})

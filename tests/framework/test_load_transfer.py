@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.cli.main import cli
-from armcal.io.parallel import Sequential, Workers
+from armcal.io.parallel import Executor
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.study import Study, StudyResult, compare
@@ -49,7 +49,7 @@ def place(tmp_path: Path) -> Path:
 
 
 def _run(path: Path, *overrides: str, data: Path | None = None, executor=None) -> StudyResult:
-    return compare(Study.load(path, overrides, data), executor or Sequential())
+    return compare(Study.load(path, overrides, data), executor or Executor(1))
 
 
 def _mean(result: StudyResult, variant: str, trained: tuple[str, ...], judged: str) -> float:
@@ -180,7 +180,7 @@ def test_payloads_are_told_apart_to_a_tenth_of_a_gram(plain: Path) -> None:
 
 @pytest.mark.slow
 def test_any_workers_give_the_same(place: Path) -> None:
-    one, other = (_run(place / "study.yaml", executor=e) for e in (Sequential(), Workers("loky", 2)))
+    one, other = (_run(place / "study.yaml", executor=e) for e in (Executor(1), Executor(2)))
     assert one.cells == other.cells
     assert all(np.array_equal(one.trained_mm[key], other.trained_mm[key], equal_nan=True) for key in one.trained_mm)
 

@@ -15,7 +15,7 @@ from armcal.cli.main import cli
 from armcal.config.yaml_source import load_variants
 from armcal.errors import ConfigError, NotConvergedError, ProblemError
 from armcal.estimate.validation import FitTask, fit_and_judge, folds
-from armcal.io.parallel import Sequential, Workers
+from armcal.io.parallel import Executor
 from armcal.report.study_document import conclusions
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -164,7 +164,7 @@ def test_a_study_that_cannot_be_is_bad_input(place: Path, change: tuple[str, str
 
 
 def _run(path: Path, *overrides: str, executor=None):
-    return compare(Study.load(path, [*FAST, *overrides]), executor or Sequential())
+    return compare(Study.load(path, [*FAST, *overrides]), executor or Executor(1))
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +223,7 @@ def test_each_rung_is_compared_with_the_one_before_or_with_one_reference(place: 
 @pytest.mark.slow
 def test_studies_are_the_same_on_any_workers(place: Path) -> None:
     path = _write(place, SMALL)
-    one, other = _run(path, "study.nested=true"), _run(path, "study.nested=true", executor=Workers("loky", 2))
+    one, other = _run(path, "study.nested=true"), _run(path, "study.nested=true", executor=Executor(2))
     for a, b in zip(one.variants, other.variants, strict=True):
         assert np.array_equal(a.errors_mm, b.errors_mm) and (a.crossed, a.change) == (b.crossed, b.change)
     assert one.nested.chosen == other.nested.chosen

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import select
+import threading
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -32,6 +32,7 @@ BOARD, CLOCK = "board", "clock"
 LONGEST_ADVANCE_S = 86400.0
 _TAKEN = "another simulated bench is running here.", "Stop it first, or give another folder."
 _LOOK_UP_S = 0.25  # how often it is looked whether the end was asked for
+_REPLUGGED_S = 0.02  # and whether the port is another one
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
@@ -79,7 +80,7 @@ class LineWorld(BenchWorld):
         file: ServoFile | None,
         folder: Path,
     ) -> None:
-        self.stopped, self._folder, self._line = False, folder, None
+        self.stopped, self._folder, self._line, self._turn = False, folder, None, threading.Lock()
         self._sender = DTrackSender(settings.tracker, settings.tracker.host, settings.tracker.port)
         super().__init__(settings, tracked, servos, file, folder / LOG, tuple(settings.tracker.bodies))
 
@@ -98,17 +99,33 @@ class LineWorld(BenchWorld):
             vacate(clock, *_TAKEN)
             self.start(self._folder / BOARD)
             # After the board: who finds the clock finds the board as well.
-            with closing(JsonServer.at(clock, *_TAKEN, self.answer)) as server, select.epoll() as edges:
-                server.watch(edges.fileno(), partial(self._attend, edges))
-                watched = None
+            with closing(JsonServer.at(clock, *_TAKEN, self._in_turn)) as server:
+                watcher = threading.Thread(target=self._watch, daemon=True)
+                watcher.start()
                 while not (self.stopped or signals.finish):
+                    server.serve(_LOOK_UP_S)
+                self.stopped = True
+                watcher.join()
+
+    def _watch(self) -> None:
+        """Attend to the port as soon as the host writes, beside those who ask at the clock's socket."""
+        watched = None
+        with select.epoll() as edges:
+            while not self.stopped:
+                with self._turn:
                     port = self._line.port if self._line is not None else None
                     if port is not None and port != watched:
                         # Edges only: a port that nobody has open is at its end all the time. A closed one left by
                         # itself.
                         edges.register(port[0], select.EPOLLIN | select.EPOLLHUP | select.EPOLLET)
                     watched = port
-                    server.serve(_LOOK_UP_S)
+                if edges.poll(_REPLUGGED_S):
+                    with self._turn:
+                        self.attend_line()
+
+    def _in_turn(self, request: dict[str, Any]) -> dict[str, Any]:
+        with self._turn:
+            return self.answer(request)
 
     def send(self, data: bytes) -> None:
         """To the host."""
@@ -140,10 +157,6 @@ class LineWorld(BenchWorld):
         self._line.flush()
         for piece in self._line.receive():
             self.receive(piece)
-
-    def _attend(self, edges: select.epoll) -> None:
-        edges.poll(0)
-        self.attend_line()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """To a client of the clock's socket.

@@ -159,9 +159,9 @@ def _executor(ctx: click.Context, option: click.Parameter, text: str) -> Any:
 parallel = click.option(
     "--parallel",
     default="auto",
-    metavar="N|BACKEND",
+    metavar="N",
     callback=_executor,
-    help="Processes for independent fits: N, threading:N, dask:ADDRESS [default: auto].",
+    help="Processes for independent fits [default: auto].",
 )
 
 

@@ -18,7 +18,7 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, no_progress
-from armcal.io.parallel import Executor, Sequential
+from armcal.io.parallel import Executor
 from armcal.problem.problem import Problem
 
 BlockLength = int | Literal["auto"]
@@ -149,7 +149,7 @@ def bootstrap(
         chosen = np.flatnonzero(weights).astype(np.intp)
         tasks.append((chosen, weights[chosen]))
     refit = partial(_refit, problem, estimator, estimate.values)
-    refits = (executor or Sequential()).map(refit, tasks, lambda done: progress("bootstrap", done))
+    refits = (executor or Executor(1)).map(refit, tasks, lambda done: progress("bootstrap", done))
     free = list(estimate.free_entries)
     values = np.array([values[free] for values in refits if values is not None]).reshape(-1, len(free))
     return Bootstrap(estimate.names, values, block, sum(values is None for values in refits))

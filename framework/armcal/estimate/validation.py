@@ -16,7 +16,7 @@ from armcal.base.units import ERROR_NAMES, ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.estimator import Estimator, Progress, Solution, gave_up, no_progress
 from armcal.estimate.polish import restricted, settled
-from armcal.io.parallel import Executor, Sequential
+from armcal.io.parallel import Executor
 from armcal.measure.measurement import Placed
 from armcal.problem.kernel import Kernel
 from armcal.problem.problem import FactorRecords, Problem
@@ -291,7 +291,7 @@ def cross_validate(
     judge: Callable[[FitTask], JudgedFit] = fit_and_judge,
 ) -> CrossValidation:
     tasks = [FitTask(problem, estimator, start, split) for split in splits]
-    fits = (executor or Sequential()).map(judge, tasks, lambda done: progress("cross-validation", done))
+    fits = (executor or Executor(1)).map(judge, tasks, lambda done: progress("cross-validation", done))
     errors, at_rest, turns = np.full((3, problem.count), np.nan)
     for split, fit in zip(splits, fits, strict=True):
         errors[split.holdout], at_rest[split.holdout] = fit.errors, fit.at_rest

@@ -2,6 +2,7 @@
 
 import signal
 import threading
+from collections.abc import Iterable
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -19,50 +20,37 @@ class Signals:
         finish, status, rotate: what was asked for.
     """
 
-    def __init__(self) -> None:
-        self.finish = False
-        self.status = False
-        self.rotate = False
-        self._before: dict[int, Any] = {}
+    def __init__(self, numbers: Iterable[int] = (*FINISH, STATUS, ROTATE)) -> None:
+        self.finish = self.status = self.rotate = False
+        self.before: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            for number in (*FINISH, STATUS, ROTATE):
-                self._before[number] = signal.signal(number, self._take)
+        self._handle(dict.fromkeys(self.before, self.take))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self._before.clear()
+        self._handle(self.before)
 
-    def _take(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, handlers: dict[int, Any]) -> None:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+    def take(self, number: int, frame: FrameType | None) -> None:
         self.finish |= number in FINISH
         self.status |= number == STATUS
         self.rotate |= number == ROTATE
 
 
-class Interrupts:
-    """While it is entered it notes that Ctrl-C came, for whoever calls a library that may keep it to itself.
+class Interrupts(Signals):
+    """While it is entered it notes that Ctrl-C came (``finish``), for who calls a library that may keep it to itself.
 
-    Outside the main thread there are none.
+    What would take Ctrl-C otherwise takes it as well.
     """
 
     def __init__(self) -> None:
-        self.came = False
-        self._before: Any = None
+        super().__init__([signal.SIGINT] if callable(signal.getsignal(signal.SIGINT)) else [])
 
-    def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._before = signal.getsignal(signal.SIGINT)
-            if callable(self._before):
-                signal.signal(signal.SIGINT, self._take)
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
-        if callable(self._before):
-            signal.signal(signal.SIGINT, self._before)
-
-    def _take(self, number: int, frame: FrameType | None) -> None:
-        self.came = True
-        self._before(number, frame)
+    def take(self, number: int, frame: FrameType | None) -> None:
+        super().take(number, frame)
+        self.before[number](number, frame)
