@@ -384,7 +384,7 @@ def test_without_a_file_the_section_goes_to_standard_output_and_the_rest_does_no
 
 
 def test_a_conversion_that_is_off_is_not_written(tmp_path, monkeypatch):
-    monkeypatch.setattr("armcal.cli.convert.difference", lambda one, two: Difference(2e-9, 0.0, 10_000, True))
+    monkeypatch.setattr("armcal.cli.calibration.difference", lambda one, two: Difference(2e-9, 0.0, 10_000, True))
     result = armcal(ARM, "--to", "poe", "--out", tmp_path / "no.yaml")
     assert result.exit_code == 1
     assert "differs by up to 2.0e-09 m" in result.stderr

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 import yaml
+from armcal.base.config_text import ConfigText
 from armcal.config import yaml_nodes
 from armcal.config.yaml_nodes import Origin, read_nodes
-from armcal.config.yaml_source import ConfigSource, ConfigText, load_config
+from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
 
 SAMPLE = """\

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from armcal.config.yaml_source import ConfigSource, ConfigText, load_config, resolve_path
+from armcal.base.config_text import ConfigText, resolve_path
+from armcal.config.yaml_source import ConfigSource, load_config
 from armcal.errors import ConfigError
 
 SAMPLE = """\
@@ -202,7 +203,6 @@ def test_a_parent_outside_the_root_is_refused_even_through_a_link(tmp_path: Path
         message = refusal(run, f"b: 1\nextends: {name}\n")
         assert message.startswith(f"{run / 'c.yaml'}:2, extends") and "outside /" in message
         assert "Copy the file into that folder" in message
-        assert load_config(run / "c.yaml", root=tmp_path).data == {"a": 1, "b": 1}
 
 
 @pytest.mark.parametrize("named", ["5", "{a: b}", "[p.yaml, 3]", "[p.yaml, p.yaml]", "null"])

@@ -354,10 +354,10 @@ def test_a_placement_stays_out_of_the_urdf_and_is_said(tmp_path):
     ],
 )
 def test_what_is_left_out_is_said_in_significant_digits(moved_m, words):
-    from armcal.cli.export import _show
+    from armcal.cli.calibration import _show_exported
 
     console, exported = MagicMock(), MagicMock(changed=2, left_out=("springs",), remarks=())
-    _show(console, MagicMock(), exported, moved_m, [Path("out.urdf")], "urdf")
+    _show_exported(console, MagicMock(), exported, moved_m, [Path("out.urdf")], "urdf")
     (said,) = console.warn.call_args.args
     assert words in said and "cannot hold it: springs" in said
 

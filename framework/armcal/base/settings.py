@@ -172,28 +172,6 @@ def _read_text(name: str, text: str, kind: Kind) -> Any:
         return Fault(f"{message}; or give the unit in the key, {accepted(name, dimension)}.")
 
 
-__all__ = [
-    "Acceleration",
-    "Acceleration3",
-    "Angle",
-    "Angle3",
-    "Compliance",
-    "Compliance3",
-    "Duration",
-    "Fault",
-    "Force",
-    "Force3",
-    "InputPath",
-    "Length",
-    "Length3",
-    "Mass",
-    "Settings",
-    "Temperature",
-    "Torque",
-    "Torque3",
-    "UnitOf",
-]
-
 _SI = "armcal_si"
 
 

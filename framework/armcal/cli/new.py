@@ -64,9 +64,9 @@ def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> N
 
     Give --dh with --convention, or --urdf; a robot called so101 has rows to begin with.
     """
-    from armcal.cli.new_robot import Source, begin  # all of the solver, which a plugin's files do without
+    from armcal.cli.new_robot import begin  # all of the solver, which a plugin's files do without
 
-    begin(console, name, Source(**source), out or Path(name))
+    begin(console, name, source, out or Path(name))
 
 
 @click.command()

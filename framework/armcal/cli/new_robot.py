@@ -2,8 +2,10 @@
 
 import math
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from armcal import scaffold
 from armcal.base.units import from_unit, parse_quantity
@@ -30,27 +32,13 @@ SKELETONS = {path.stem: path for path in sorted(Path(scaffold.__file__).with_nam
 """Rows of arms that many people have, in round numbers, by the name that begins one."""
 
 
-@dataclass(frozen=True)
-class Source:
-    """What a robot is made from, as given on the command line."""
-
-    dh: Path | None
-    convention: str | None
-    urdf: Path | None
-    tip: str | None
-    up: str | None
-    target: str | None
-    prior_mm: float | None
-    prior_deg: float | None
-
-
-def begin(console: Console, name: str, source: Source, folder: Path) -> None:
-    """Write a robot's folder, calibrate its simulated records, and say how that went."""
+def begin(console: Console, name: str, given: Mapping[str, Any], folder: Path) -> None:
+    """Write the folder of a robot from what was given, calibrate its simulated records, and say how that went."""
     registry = console.registry()
-    robot = _robot(robot_name(name), source, registry)
-    up = direction(source.up) if source.up else robot.up
-    robot = replace(robot, up=up, target=place(source.target) if source.target else robot.target)
-    choice = write_robot(replace(robot, widths=_widths(source)), folder, registry)
+    robot = _robot(robot_name(name), given, registry)
+    up = direction(given["up"]) if given["up"] else robot.up
+    robot = replace(robot, up=up, target=place(given["target"]) if given["target"] else robot.target)
+    choice = write_robot(replace(robot, widths=_widths(given)), folder, registry)
     with console.progress() as progress:
         trial = try_out(folder, registry, command_line(), progress)
     content = {
@@ -68,7 +56,7 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
     for text in trial.result.warnings:
         console.warn(text)
     console.line(f"{robot.name}: {len(robot.joints)} joints, {len(choice.deviations)} free parameters, in {folder}")
-    if robot.name in SKELETONS and not (source.dh or source.urdf):
+    if robot.name in SKELETONS and not (given["dh"] or given["urdf"]):
         console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
     for note in robot.notes:
         console.line(f"{source.urdf}: {note}")
@@ -89,9 +77,9 @@ def begin(console: Console, name: str, source: Source, folder: Path) -> None:
         sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
 
 
-def _widths(source: Source) -> dict[Unit, float]:
-    given: dict[Unit, float | None] = {"mm": source.prior_mm, "deg": source.prior_deg}
-    widths = {**WIDTHS, **{unit: width for unit, width in given.items() if width is not None}}
+def _widths(given: Mapping[str, Any]) -> dict[Unit, float]:
+    stated = {unit: given[f"prior_{unit}"] for unit in WIDTHS}
+    widths: dict[Unit, float] = {unit: WIDTHS[unit] if width is None else width for unit, width in stated.items()}
     for unit, width in widths.items():
         if not 0 < width < math.inf:
             hint = f"Give how far the robot may well be off its file (standard deviation, {unit})."
@@ -99,30 +87,31 @@ def _widths(source: Source) -> dict[Unit, float]:
     return widths
 
 
-def _robot(name: str, source: Source, registry: PluginRegistry) -> Robot:
-    if source.dh and source.urdf:
+def _robot(name: str, given: Mapping[str, Any], registry: PluginRegistry) -> Robot:
+    dh, urdf, convention = (given[key] for key in ("dh", "urdf", "convention"))
+    if dh and urdf:
         raise ConfigError("found both --dh and --urdf, expected one of them.", hint="Leave one out.")
-    if source.tip and not source.urdf:
+    if given["tip"] and not urdf:
         raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
-    if source.convention and not source.dh:
+    if convention and not dh:
         raise ConfigError("found --convention without --dh.", hint="Give --dh FILE, or leave it out.")
-    if source.urdf:
-        return robot_of_urdf(name, source.urdf, source.tip, registry)
-    if not source.dh and name in SKELETONS:
+    if urdf:
+        return robot_of_urdf(name, urdf, given["tip"], registry)
+    if not dh and name in SKELETONS:
         return robot_of_rows(name, "standard", read_rows(SKELETONS[name], registry))
-    if not source.dh:
+    if not dh:
         raise ConfigError(
             f"found no description of the robot {name}, expected a file of it, or the name of a known skeleton "
             f"({', '.join(SKELETONS)}).",
             hint="Give --dh FILE with --convention, or --urdf FILE.",
         )
-    if source.convention is None:
+    if convention is None:
         raise ConfigError(
             "found --dh without --convention: two go by the same name.",
             hint="Give --convention standard, Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha), or modified, "
             "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
         )
-    return robot_of_rows(name, CONVENTIONS[source.convention], read_rows(source.dh, registry))
+    return robot_of_rows(name, CONVENTIONS[convention], read_rows(dh, registry))
 
 
 def direction(text: str) -> tuple[float, float, float]:

@@ -6,8 +6,7 @@ One file is read by what drives the boards and by what calibrates the arm, so th
 import hashlib
 import json
 import math
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
@@ -16,17 +15,15 @@ from pydantic import Field, model_validator
 
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.settings import Settings, UnitOf
-from armcal.base.units import from_unit
+from armcal.base.units import from_unit, to_unit
 from armcal.config.validate import validate
-from armcal.config.yaml_nodes import read_plain
+from armcal.config.yaml_nodes import word
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 
 ALL_CALL = 0x70
 ADDRESSES = (0x40, 0x77)  # The lowest and the highest that a board's pins may set; 0x78 to 0x7f are reserved. [PCA9685]
 CHANNELS = 16
-
-_PLAIN = re.compile(r"[A-Za-z_]\w*")
 
 Angles = Annotated[tuple[float, ...], UnitOf("angle")]
 Pulses = Annotated[tuple[float, ...], UnitOf("time")]
@@ -207,23 +204,23 @@ def load_servo_file(path: str | Path) -> ServoFile:
 
 def servo_file_text(file: ServoFile) -> str:
     lines = ["boards:"]
-    lines += [f"  {_word(name)}: {{{_listed(board_fields(board))}}}" for name, board in file.boards.items()]
+    lines += [f"  {word(name)}: {{{_listed(board_fields(board))}}}" for name, board in file.boards.items()]
     lines.append("servos:")
-    lines += [f"  {_word(joint)}: {{{_listed(servo_fields(servo))}}}" for joint, servo in file.servos.items()]
+    lines += [f"  {word(joint)}: {{{_listed(servo_fields(servo))}}}" for joint, servo in file.servos.items()]
     return "\n".join(lines) + "\n"
 
 
 def board_fields(board: BoardSettings) -> list[tuple[str, str]]:
     clock = [("oscillator_hz", _number(board.oscillator_hz)), ("rate_hz", _number(board.rate_hz))]
-    return [("address", f"0x{board.address:02x}"), *clock, ("id", _quoted(board.id))]
+    return [("address", f"0x{board.address:02x}"), *clock, ("id", json.dumps(board.id, ensure_ascii=False))]
 
 
 def servo_fields(servo: ServoSettings) -> list[tuple[str, str]]:
-    angles = _in_unit("angles", servo.angles, "deg", math.degrees, "rad")
-    pulses = _in_unit("pulses", servo.pulses, "us", lambda pulse: 1e6 * pulse, "s")
-    borne = _in_unit("pulse_range", servo.pulse_range, "us", lambda pulse: 1e6 * pulse, "s")
+    angles = _in_unit("angles", servo.angles, "deg", "rad")
+    pulses = _in_unit("pulses", servo.pulses, "us", "s")
+    borne = _in_unit("pulse_range", servo.pulse_range, "us", "s")
     stated = [borne] if "pulse_range" in servo.model_fields_set else []
-    return [("board", _word(servo.board)), ("channel", str(servo.channel)), angles, pulses, *stated]
+    return [("board", word(servo.board)), ("channel", str(servo.channel)), angles, pulses, *stated]
 
 
 def _listed(fields: list[tuple[str, str]]) -> str:
@@ -258,11 +255,9 @@ def check_longest(table: PulseTable, clock: PulseClock) -> None:
         raise ValueError(f"a pulse of {1e6 * longest:g} us is longer than the board's longest, {1e6 * limit:.0f} us")
 
 
-def _in_unit(
-    name: str, values: tuple[float, ...], unit: str, convert: Callable[[float], float], si: str
-) -> tuple[str, str]:
+def _in_unit(name: str, values: tuple[float, ...], unit: str, si: str) -> tuple[str, str]:
     """The numbers in a customary unit if every one can be read back from it to the last bit, in SI otherwise."""
-    written = [_exact(value, unit, convert(value)) for value in values]
+    written = [_exact(value, unit) for value in values]
     stated = [number for number in written if number is not None]
     key, numbers = (f"{name}_{unit}", stated) if len(stated) == len(values) else (f"{name}_{si}", list(values))
     return key, f"[{', '.join(map(_number, numbers))}]"
@@ -274,16 +269,9 @@ def _number(value: float) -> str:
     return f"{mantissa}{'' if '.' in mantissa or not e else '.0'}{e}{exponent}"
 
 
-def _word(text: str) -> str:
-    return str(text) if _PLAIN.fullmatch(text) and read_plain(text) == text else _quoted(text)
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(str(text), ensure_ascii=False)
-
-
-def _exact(value: float, unit: str, near: float) -> float | None:
-    """The shortest number next to ``near`` that is read as exactly ``value``."""
+def _exact(value: float, unit: str) -> float | None:
+    """The shortest number in a unit that is read as exactly ``value`` (SI)."""
+    near = to_unit(value, unit)
     tried = [round(near, digits) for digits in range(1, 13)]
     tried += [near, math.nextafter(near, math.inf), math.nextafter(near, -math.inf)]
     return next((number for number in tried if from_unit(number, unit) == value), None)

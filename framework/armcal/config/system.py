@@ -185,8 +185,7 @@ def build_component(
     settings_class = getattr(component, "Settings", None)
     if not (isinstance(settings_class, type) and issubclass(settings_class, Settings)):
         raise _broken(registered, "it has no class attribute Settings derived from armcal.Settings")
-    stripped = {key: value for key, value in section.items() if key != "type"}
-    settings = validate(settings_class, _with(source, at, stripped), at)
+    settings = validate(settings_class, source, at, beside=("type",))
     try:
         built = _refusable(source, at, lambda: component(settings, *context))
     except ArmcalError:
@@ -337,12 +336,3 @@ def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:
         return build()
     except ValueError as fault:
         raise ConfigError(f"{fault}.", where=source.where(at)) from fault
-
-
-def _with(source: ConfigSource, path: Path, value: Any) -> ConfigSource:
-    def rebuilt(data: Any, steps: Path) -> Any:
-        if not steps:
-            return value
-        return {**data, steps[0]: rebuilt(data[steps[0]], steps[1:])}
-
-    return replace(source, data=rebuilt(source.data, path))

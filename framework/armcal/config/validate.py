@@ -1,7 +1,7 @@
 """Settings checked against the configuration they came from: every fault at once, each at its own line."""
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, TypeVar
@@ -61,19 +61,24 @@ class _Finding:
         return f"found {self.value}, expected {self.expected}: {self.mend}{end}"
 
 
-def validate(settings_class: type[S], source: ConfigSource, at: tuple[Step, ...] = ()) -> S:
+def validate(
+    settings_class: type[S], source: ConfigSource, at: tuple[Step, ...] = (), beside: Collection[str] = ()
+) -> S:
     """Check the part of a configuration below a path.
 
     Args:
         settings_class: the settings it must make.
         source: the configuration.
         at: the path of the part; ``()`` is the whole.
+        beside: keys of the part that are another's.
 
     Raises:
         ConfigError: lists every fault with its file, line and field, what was found, what was expected and
             the mend; its ``where`` is that of the first.
     """
     raw = _part(settings_class, source, at)
+    if beside and isinstance(raw, dict):
+        raw = {key: value for key, value in raw.items() if key not in beside}
     try:
         return settings_class.model_validate(raw)
     except ValidationError as fault:

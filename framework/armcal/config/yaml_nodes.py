@@ -6,6 +6,7 @@ anything is built and no tag can construct an object.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable
@@ -29,6 +30,7 @@ _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 _HEX = re.compile(r"[-+]?0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
 _LOOSE_EXPONENT = re.compile(r"([-+]?)([0-9]+\.?[0-9]*|\.[0-9]+)[eE]([-+]?)([0-9]+)")
+_WORD = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?\.(inf|Inf|INF|nan|NaN|NAN)")
 _CLOCK = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
 _OCTAL = re.compile(r"[-+]?(0[0-9_]+|0o[0-7_]+|0b[01_]+|0x[0-9a-fA-F_]*_[0-9a-fA-F_]*)")
@@ -77,6 +79,12 @@ def needs_quotes(text: str) -> bool:
     except ScalarError:
         return True
     return False
+
+
+def word(text: str) -> str:
+    """A text as a scalar of a file: bare where every YAML reader takes it for text, else in double quotes."""
+    is_plain = _WORD.fullmatch(text) and text.lower() not in ("y", "n") and read_plain(text) == text
+    return str(text) if is_plain else json.dumps(str(text), ensure_ascii=False)
 
 
 def _refuse_surprises(text: str) -> None:

@@ -28,8 +28,6 @@ from armcal.config.yaml_nodes import (
 from armcal.errors import ConfigError, Location
 from armcal.io.plain_files import input_bytes
 
-__all__ = ["ConfigSource", "ConfigText", "find_key", "load_config", "resolve_path"]
-
 MAX_BYTES = 16 << 20  # A calibration with 600 free parameters, or with 50 000 records of a drift, is smaller
 MAX_FILES = 32
 
@@ -92,7 +90,6 @@ def find_key(value: Any, step: Step) -> Step | None:
 def load_config(
     path: str | Path,
     overrides: Sequence[str] = (),
-    root: Path | None = None,
     check: Callable[[str], object] | None = None,
     content: bytes | None = None,
 ) -> ConfigSource:
@@ -102,7 +99,6 @@ def load_config(
         path: the config file.
         overrides: ``a.b=value`` each, applied in order; a value is YAML, a list is indexed
             (``rows.2.d_mm=3``), null removes a key, and a key that holds a dot is put in double quotes.
-        root: what no path in a config may leave; the directory of the config unless given.
         check: is given the text of the config before anything is made of it, and may raise.
         content: what the config file holds, where it need not be there; such a config names no other file.
 
@@ -110,18 +106,17 @@ def load_config(
         ConfigError: what was found, where, and the mend.
     """
     path = Path(path)
-    # Nothing lies below a file.
-    reader = Reader(root_of(path, root if content is None else path), check, content)
+    # A path below a file leads nowhere.
+    reader = Reader(_root_of(path if content is None else path / path.name), check, content)
     tree = reader.tree(path, ())
     for text in overrides:
         tree = override(tree, text)
     return as_source(tree, path, reader)
 
 
-def root_of(path: Path, root: Path | None) -> Path:
-    """What no path in a config may leave, resolved: the directory of the config unless given."""
+def _root_of(path: Path) -> Path:
     try:
-        return (path.parent if root is None else root).resolve()
+        return path.parent.resolve()
     except (OSError, RuntimeError, ValueError) as fault:
         _refuse_file(path, f"this path cannot be followed ({fault}).", "Check its spelling and its symbolic links.")
 
@@ -259,9 +254,7 @@ class Variants:
     variants: dict[str, ConfigSource]
 
 
-def load_variants(
-    path: str | Path, overrides: Sequence[str] = (), root: Path | None = None, listed: tuple[str, str] = VARIANTS
-) -> Variants:
+def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple[str, str] = VARIANTS) -> Variants:
     """Read the variants that a YAML config lists; without any, the config itself is the only one, called as the file.
 
     A variant is the rest of the config, then what it ``extends`` (an earlier variant by its name, files), then the
@@ -272,7 +265,7 @@ def load_variants(
         ConfigError: what was found, where, and the mend.
     """
     path = Path(path)
-    reader = Reader(root_of(path, root))
+    reader = Reader(_root_of(path))
     tree = reader.tree(path, ())
     for text in overrides:
         tree = override(tree, text)

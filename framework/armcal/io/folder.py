@@ -1,14 +1,12 @@
 """Folders that results are left in: only ours are written to, by one run at a time, and nothing is overwritten.
 
-A set of files is made in a temporary folder within. That of an earlier run then moves to ``earlier/N``, and the new
+A set of files is made beside their places. That of an earlier run then moves to ``earlier/N``, and the new
 files take its place one by one. What stands last among them (``calibration.yaml``) is away first and in place last: a
 run that is killed meanwhile leaves none, rather than one among files of another run.
 """
 
 import errno
 import os
-import shutil
-import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from armcal.errors import InputError, Location
-from armcal.io.plain_files import STAGED, sync_folder, write_durably
+from armcal.io.plain_files import STAGED, staged, sync_folder, writing
 
 EARLIER = "earlier"
 _LOCK = f"{STAGED}lock"
@@ -36,19 +34,14 @@ class Reservation:
         Raises:
             InputError: the folder cannot be written; then it is as it was.
         """
-        try:
-            staging = Path(tempfile.mkdtemp(prefix=STAGED, dir=self.folder))
-            try:
-                for name, text in contents.items():
-                    write_durably(staging / name, text.encode() if isinstance(text, str) else text)
-                self._exchange(staging, list(contents))
-            finally:
-                shutil.rmtree(staging, ignore_errors=True)
-        except OSError as fault:
-            hint = "Give --out a writable directory with room on its disk."
-            raise InputError(f"it cannot be written ({fault}).", where=Location(str(self.folder)), hint=hint) from fault
+        files = {
+            self.folder / name: text.encode() if isinstance(text, str) else text for name, text in contents.items()
+        }
+        hint = "Give --out a writable directory with room on its disk."
+        with staged(files, hint) as ready, writing(self.folder, hint):
+            self._exchange(ready)
 
-    def _exchange(self, staging: Path, names: list[str]) -> None:
+    def _exchange(self, ready: Mapping[Path, Path]) -> None:
         """Move files, one after another; all of them back if one cannot be moved, or at an interrupt."""
         folder, kept = self.folder, self.folder
         present = [name for name in self.ours if os.path.lexists(folder / name)]
@@ -60,7 +53,7 @@ class Reservation:
         away = [(folder / name, kept / name) for name in reversed(present)]
         done: list[tuple[Path, Path]] = []
         try:
-            for source, target in (*away, *((staging / name, folder / name) for name in names)):
+            for source, target in (*away, *((source, place) for place, source in ready.items())):
                 done.append((source, target))
                 os.replace(source, target)
         except BaseException:
@@ -85,16 +78,13 @@ def reserved(folder: Path, ours: Collection[str]) -> Iterator[Reservation]:
     check_folder(folder, ours)
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     lock = FileLock(folder / _LOCK, timeout=0)
-    try:
+    with writing(folder, "Give --out a writable directory."):
         folder.mkdir(parents=True, exist_ok=True)
         _acquire(lock, folder)
-    except OSError as fault:
-        hint = "Give --out a writable directory."
-        raise InputError(f"it cannot be written ({fault}).", where=Location(str(folder)), hint=hint) from fault
     try:
         for litter in folder.glob(f"{STAGED}*"):
-            if litter.is_dir():
-                shutil.rmtree(litter, ignore_errors=True)
+            if litter.name != _LOCK:
+                litter.unlink()
         yield Reservation(folder, ours)
     finally:
         with suppress(OSError):

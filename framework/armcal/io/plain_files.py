@@ -190,23 +190,32 @@ def write_over(files: Mapping[Path, bytes]) -> None:
     Raises:
         InputError: one cannot be written; as long as that was for want of room, none is.
     """
-    staged: dict[Path, Path] = {}
-    place = Path()
+    hint = "Give --out a place that can be written, in a folder that is there."
+    for place in files:
+        check_output(place)
+    with staged(files, hint) as ready:
+        for place, source in ready.items():
+            with writing(place, hint):
+                os.replace(source, place)
+
+
+@contextmanager
+def staged(files: Mapping[Path, bytes], hint: str) -> Iterator[dict[Path, Path]]:
+    """Files by their places, durable beside them; what is not moved from there is removed.
+
+    Raises:
+        InputError: one cannot be written.
+    """
+    ready = {place: place.with_name(f"{STAGED}{place.name}") for place in files}
     try:
-        for place in files:
-            check_output(place)
         for place, content in files.items():
-            staged[place] = place.with_name(f"{STAGED}{place.name}")
-            write_durably(staged[place], content)
-        for place, ready in staged.items():
-            os.replace(ready, place)
-    except OSError as fault:
-        hint = "Give --out a place that can be written, in a folder that is there."
-        raise InputError(f"it cannot be written ({fault.strerror}).", where=Location(str(place)), hint=hint) from fault
+            with writing(place, hint):
+                write_durably(ready[place], content)
+        yield ready
     finally:
-        for left in staged.values():
+        for source in ready.values():
             with suppress(OSError):
-                left.unlink(missing_ok=True)
+                source.unlink(missing_ok=True)
 
 
 def require_new(paths: Sequence[Path]) -> None:

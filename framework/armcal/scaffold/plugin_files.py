@@ -2,7 +2,6 @@
 appear whole or not at all."""
 
 import importlib.util
-import json
 import keyword
 import re
 import shutil
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from armcal.config.yaml_nodes import word
 from armcal.errors import InputError, Location
 from armcal.hooks import KINDS as HOOKS
 from armcal.io.plain_files import writing
@@ -23,8 +23,6 @@ LONGEST = 20  # characters; lines with a longer name would not fit the width tha
 PREFIX = "armcal_"
 _PLUGIN = re.compile(r"[a-z][a-z0-9_]*")
 TEMPLATES = Path(__file__).with_name("templates")
-_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_YAML_WORDS = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
 _DIGITS = 12
 
 
@@ -46,12 +44,6 @@ def rendered_file(template: str, context: Mapping[str, Any]) -> str:
     )
     environment.filters |= {"word": word, "number": number}
     return environment.get_template(template).render(context)
-
-
-def word(text: str) -> str:
-    """A text as a YAML scalar: plain where YAML reads it as text, else in double quotes."""
-    plain = _PLAIN.fullmatch(text) and text.lower() not in _YAML_WORDS
-    return text if plain else json.dumps(text, ensure_ascii=False)
 
 
 def number(value: float) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import recorded_bags as bags
 from armcal.calibration.calibration import Calibration
-from armcal.cli.export import export
+from armcal.cli.calibration import export
 from armcal.cli.run import run
 from armcal.errors import ConfigError
 from click.testing import CliRunner
