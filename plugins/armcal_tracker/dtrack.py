@@ -25,7 +25,7 @@ from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import TrackerFrame
 from armcal.errors import InputError, Location
-from armcal.io.udp import bound
+from armcal.io.lines import bound
 from pydantic import Field, field_validator
 from typing_extensions import override
 

@@ -17,8 +17,7 @@ from armcal.base.config_text import resolve_path
 from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import JointStream
 from armcal.errors import ConfigError, InputError, Location
-from armcal.io.lines import LineCutter
-from armcal.io.udp import LOOPBACK, bound, port_of
+from armcal.io.lines import LOOPBACK, LineCutter, bound, port_of
 
 STANDARD_INPUT = "-"
 KINDS = "- (standard input), udp:PORT of this machine, or a file that another program writes"

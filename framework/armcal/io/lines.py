@@ -1,11 +1,19 @@
-"""Lines: cut from bytes as they come, and written to standard output, which may be closed or not read by anyone."""
+"""Lines: cut from bytes as they come, by UDP too, and written to standard output, which may be closed or not read.
+
+A UDP port is of this machine; datagrams of others come by socat or SSH.
+"""
 
 import io
 import os
+import re
 import select
+import socket
 from typing import BinaryIO
 
+from armcal.errors import InputError, Location
+
 MAX_LINE_BYTES = 1024**2
+LOOPBACK = "127.0.0.1"
 
 
 class LineCutter:
@@ -111,3 +119,31 @@ def _descriptor(stream: BinaryIO | None) -> int | None:
         return None if stream is None else stream.fileno()
     except (OSError, io.UnsupportedOperation):
         return None
+
+
+def port_of(text: str) -> int | None:
+    """The port of ``udp:PORT``, which this machine alone reaches; None if it is none."""
+    match = re.fullmatch("udp:([0-9]{1,5})", text)
+    return None if match is None or int(match[1]) > 65535 else int(match[1])
+
+
+def bound(host: str, port: int) -> socket.socket:
+    """A socket that does not block.
+
+    Raises:
+        InputError: the port cannot be opened.
+    """
+    where = Location(f"udp:{host}:{port}")
+    try:
+        kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
+        bound_socket = socket.socket(kind, socket.SOCK_DGRAM)
+        try:
+            bound_socket.bind(address)
+        except OSError:
+            bound_socket.close()
+            raise
+    except (OSError, UnicodeError) as fault:
+        hint = "Give a free port, and an address of this machine."
+        raise InputError(f"the socket cannot be opened ({fault}).", where=where, hint=hint) from fault
+    bound_socket.setblocking(False)
+    return bound_socket

@@ -3,7 +3,7 @@
 import signal
 import threading
 from collections.abc import Iterable
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any, Self
 
 FINISH = (signal.SIGTERM, signal.SIGINT)
@@ -28,7 +28,7 @@ class Signals:
         self._handle(dict.fromkeys(self.before, self.take))
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *fault: object) -> None:
         self._handle(self.before)
 
     def _handle(self, handlers: dict[int, Any]) -> None:
