@@ -159,6 +159,7 @@ class JsonServer:
         self._clients: dict[threading.Thread, socket.socket | None] = {}
         self._waiting: set[threading.Thread] = set()  # for an answer, or for somebody to take it
         self._listener: socket.socket | None = None
+        self._accepting: threading.Thread | None = None
         self._path = Path()
 
     @classmethod
@@ -208,7 +209,8 @@ class JsonServer:
             listener.close()
             raise
         self._listener, self._path = listener, path
-        threading.Thread(target=self._accept, args=[listener], daemon=True).start()
+        self._accepting = threading.Thread(target=self._accept, args=[listener], daemon=True)
+        self._accepting.start()
 
     def attach(self, incoming: int, outgoing: int) -> None:
         """Serve a pair of descriptors, which stay the caller's."""
@@ -241,6 +243,9 @@ class JsonServer:
     def close(self) -> None:
         """End; who does not take the answer that it was given has a moment to do so."""
         self.stop_reading()
+        if self._accepting is not None:
+            self._accepting.join()
+            self.stop_reading()  # of who came meanwhile
         ends = time.monotonic() + _GRACE_S
         for client, connection in [*self._clients.items()]:
             while connection is not None and client.is_alive():
