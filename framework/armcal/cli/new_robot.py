@@ -59,7 +59,7 @@ def begin(console: Console, name: str, given: Mapping[str, Any], folder: Path) -
     if robot.name in SKELETONS and not (given["dh"] or given["urdf"]):
         console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
     for note in robot.notes:
-        console.line(f"{source.urdf}: {note}")
+        console.line(f"{given['urdf']}: {note}")
     assumed = [joint.name for joint in robot.joints if joint.assumed]
     if assumed:
         console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
