@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 from armcal.errors import DataError
 from armcal.io.lines import StandardOutput
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import Pace
 from armcal_online.running.session import Setup, opened
-from armcal_online.sources.row_parser import RowParser
+from armcal_online.sources import Lines, RowParser, open_source
 from armcal_online.tracking.settings import RecalibrateSettings
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
@@ -101,9 +102,15 @@ def setup(folder, pace=None, stream=None, **given):
 
 
 def main(folder, source, at_end):
-    """Recalibrate with the fake, as the command does."""
+    """Recalibrate with the fake, as the command does; a file that is to be waited for comes through ``tail``."""
     fake = FakeRecalibrator()
-    records = open_source(source, RowParser(fake.request, {}), at_end)
+    rows = RowParser(fake.request, {})
+    if at_end == "wait":
+        followed = ["tail", "-n", "+1", "-F", "-s", "0.02", "--pid", str(os.getpid()), source]
+        tail = subprocess.Popen(followed, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        records = Lines(rows, tail.stdout.fileno())
+    else:
+        records = open_source(source, rows)
     with opened(setup(folder, stream=sys.stdout.buffer), fake, records) as going:
         going.run()
 

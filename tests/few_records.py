@@ -19,7 +19,7 @@ from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import reserved, write
 from armcal.run.pipeline import calibrate
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings
 from scipy.spatial.transform import Rotation

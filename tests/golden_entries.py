@@ -644,7 +644,7 @@ ENTRIES: tuple[Entry, ...] = (
         "recalibrate",
         "a joint slips; killed, gone on, rolled back",
         stream("poses.csv", 40, 12),
-        killed_after(25, f"{KEPT} --follow"),
+        killed_after(25, KEPT),
         KEPT,
         decisions,
         "control {out}/kept rollback good --json",

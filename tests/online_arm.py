@@ -21,7 +21,7 @@ from armcal.config.yaml_source import load_config
 from armcal.estimate.online import OnlineEstimator, Update
 from armcal.plugins import discover
 from armcal.problem.problem import Problem
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.observer import RecordObservation
 from armcal_online.tracking.recalibrator import Recalibrator

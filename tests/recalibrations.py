@@ -14,7 +14,7 @@ from armcal.io import plain_files
 from armcal.io.journal import JOURNAL, Entry, KeptJournal
 from armcal_online.running.loop import Recalibration, StateReplayer
 from armcal_online.running.session import opened
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
 
 

@@ -35,7 +35,7 @@ from armcal.measure.checks import read_as
 from armcal.measure.layout import warned
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import is_number, may_be_cut, whole_rows
+from armcal.measure.tables import is_number
 from armcal.plugins import discover
 from scipy.spatial.transform import Rotation
 
@@ -271,8 +271,8 @@ def _rows(text: str) -> list[tuple[int, list[str]]]:
 def _table(path: Path, arm: Arm, first: Mapping[str, float], request: ReadRequest) -> Dataset:
     """base_T_flange in metres, row by row: 12 or 16 numbers a line, or a matrix in four lines of four."""
     content = input_bytes(path, _MAX_BYTES, "a table of flange poses")
-    rows, matrices, lines = _rows(content.decode("utf-8-sig")), [], []
-    for line, cells in whole_rows(iter(rows), path, "the last column") if may_be_cut(content) else rows:
+    matrices, lines = [], []
+    for line, cells in _rows(content.decode("utf-8-sig")):
         if len(cells) not in (12, 16) or not all(is_number(cell) for cell in cells):
             refuse(path, f"found {len(cells)} cells, expected 12 or 16 numbers.", _FORMS, line)
         matrix = np.array([float(cell) for cell in cells]).reshape(-1, 4)

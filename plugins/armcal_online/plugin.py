@@ -4,7 +4,7 @@ from armcal.hooks import Register, hookimpl
 
 _COMMANDS = {
     "recalibrate": ("recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
-    "control": ("control:control", "Query or command a running recalibration."),
+    "control": ("recalibrate:control", "Query or command a running recalibration."),
     "watch": ("watch:watch", "Show a recalibration live, in the browser."),
     "mission": ("mission:mission", "Simulate a mission, recalibrate over it, compare that with its truth."),
 }

@@ -15,7 +15,7 @@ import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.io.json_server import MOST_CLIENTS, JsonServer
-from armcal_online.running.control import answer, ask, control_server
+from armcal_online.running.session import answer, ask, control_server
 from armcal_online.running.situation import SOCKET
 from click.testing import CliRunner
 

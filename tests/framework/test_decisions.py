@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from armcal.estimate.online import Gaussian
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, Decision, advice, log_odds_of, per_cent, sure
 from armcal_online.tracking.events import decided, last_good, record_name, spoken_time

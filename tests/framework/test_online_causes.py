@@ -14,7 +14,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal_online.mission.mission import MissionPlan, before_launch
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.state import Health
 from online_arm import AXES, JOINTS, World, begun, calibration, told

@@ -13,7 +13,7 @@ import pytest
 from armcal.base.parameters import Parameters
 from armcal.estimate.online import Gaussian
 from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.belief import Belief, StateSpace
 from armcal_online.tracking.observer import Observer
 from armcal_online.tracking.recalibrator import Recalibrator

@@ -16,7 +16,7 @@ from armcal.estimate.online import Gaussian
 from armcal.run.experiment import Experiment
 from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings

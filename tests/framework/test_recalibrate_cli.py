@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal_online.running.control import ask
+from armcal_online.running.session import ask
 from click.testing import CliRunner, Result
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,7 +101,7 @@ def test_kills_of_the_whole_command_change_no_bit(
     random_, folder = random.Random(4), tmp_path / "out"
     arguments = ["recalibrate", calibration, "--from", poses, "--config", config, "--out", folder]
     for _ in range(3):
-        command = [sys.executable, "-m", "armcal.cli", *map(str, arguments), "--follow"]
+        command = [sys.executable, "-m", "armcal.cli", *map(str, arguments)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         assert process.stdout is not None
         for _ in range(random_.randint(2, 30)):
@@ -118,7 +118,10 @@ def test_kills_of_the_whole_command_change_no_bit(
 
 @pytest.mark.slow
 def test_fifty_kills_at_any_moment_of_a_long_run_change_no_bit(calibration: Path, config: Path, tmp_path: Path) -> None:
-    """Of 6,000 records, in starting, in reading, in writing: the command takes about as long as all kills together."""
+    """Of 6,000 records, in starting, in reading, in writing: the command takes about as long as all kills together.
+
+    They come through ``tail``, which begins again with the first one each time; in the end the file itself is read.
+    """
     header, *rows = POSES.read_text().splitlines()
     many = [f"{turn}x{row},{60 * (200 * turn + i)}" for turn in range(30) for i, row in enumerate(rows)]
     poses = tmp_path / "poses.csv"
@@ -127,11 +130,15 @@ def test_fifty_kills_at_any_moment_of_a_long_run_change_no_bit(calibration: Path
     assert armcal(*arguments, tmp_path / "whole").exit_code == 0
     random_, folder = random.Random(7), tmp_path / "killed"
     for _ in range(50):
-        process = subprocess.Popen([sys.executable, "-m", "armcal.cli", *map(str, arguments), str(folder), "--follow"])
+        tail = subprocess.Popen(["tail", "-n", "+1", "-F", poses], stdout=subprocess.PIPE)
+        piped = ["-" if argument is poses else str(argument) for argument in arguments]
+        command = [sys.executable, "-m", "armcal.cli", *piped, str(folder)]
+        process = subprocess.Popen(command, stdin=tail.stdout)
         time.sleep(random_.uniform(0.5, 2.5))
         assert process.poll() is None
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        for part in (process, tail):
+            part.send_signal(signal.SIGKILL)
+            part.wait()
     assert armcal(*arguments, folder).exit_code == 0
     assert estimate(folder) == estimate(tmp_path / "whole")
 

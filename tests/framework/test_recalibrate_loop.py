@@ -11,13 +11,9 @@ from typing import Any
 import pytest
 from armcal.errors import InputError
 from armcal.io.journal import Journal, JournalFullError, KeptJournal
-from armcal_online.commands.recalibrate import open_source
-from armcal_online.running.control import answer
 from armcal_online.running.loop import Pace, Recalibration
-from armcal_online.running.session import opened
-from armcal_online.sources.row_parser import RowParser
-from armcal_online.sources.source import Incoming
-from armcal_online.sources.streams import Sent
+from armcal_online.running.session import answer, opened
+from armcal_online.sources import Incoming, RowParser, Sent, open_source
 from armcal_online.tracking.settings import RecalibrateSettings
 from fake_recalibrator import FakeRecalibrator, setup
 from recalibrations import (

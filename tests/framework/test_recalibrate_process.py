@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from armcal.cli.main import cli
 from armcal.io.json_server import JsonClient
-from armcal_online.running.control import ask
+from armcal_online.running.session import ask
 from armcal_online.running.situation import SOCKET
 from click.testing import CliRunner
 from fake_recalibrator import row
@@ -74,14 +74,12 @@ def test_signals_and_control_of_a_running_process(tmp_path: Path, number: signal
     assert "expected a sequence number" in ask(folder, {"command": "rollback"})["error"]
     assert ask(folder, {"command": "resume"})["ok"]
     wait_for(folder, '"p31"')
-    going.send_signal(signal.SIGHUP)
-    going.send_signal(signal.SIGUSR1)
-    while not (folder / "events.jsonl.1").exists():
-        time.sleep(0.01)
     going.send_signal(number)
     assert going.wait(20) == 0
     assert "asked to finish by a signal" in events(folder)[-1]["sentence"]
-    assert json.loads((folder / "calibration.yaml").read_text())["count"] == 8
+    assert json.loads((folder / "calibration.yaml").read_text())["count"] == 7, (
+        "what a pipe gave meanwhile is passed over"
+    )
     assert replayed(folder).calibration_text() == (folder / "calibration.yaml").read_text()
 
 

@@ -106,16 +106,18 @@ def test_after_the_end_the_estimate_goes_back_to_the_last_good_record_and_forth_
 @pytest.mark.slow
 def test_after_a_kill_too(command: list[str], ended: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    started = [sys.executable, "-m", "armcal.cli", *command, str(folder), "--follow"]
-    process = subprocess.Popen(started, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    tail = subprocess.Popen(["tail", "-n", "+1", "-F", command[3]], stdout=subprocess.PIPE)
+    started = [sys.executable, "-m", "armcal.cli", *command[:3], "-", *command[4:], str(folder)]
+    process = subprocess.Popen(started, stdin=tail.stdout, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 120
         while not (folder / "journal.sqlite").exists() or len(taken(folder)) < GOOD + SLIPPED:
             assert time.monotonic() < deadline and process.poll() is None
             time.sleep(0.2)
     finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        for part in (process, tail):
+            part.send_signal(signal.SIGKILL)
+            part.wait()
     assert (folder / "control.sock").exists()  # nobody took it away
     reply = check_rolled_back(command, folder, tmp_path)
     assert reply["to"] == events(ended, "decision")[0]["last_good"]["sequence"]

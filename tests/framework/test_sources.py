@@ -8,18 +8,15 @@ import os
 import random
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, InputError
 from armcal.io.lines import LineCutter
-from armcal_online.commands.recalibrate import open_source
 from armcal_online.running.loop import MAX_FILES, Progress
-from armcal_online.sources.csv_file import CsvFile
-from armcal_online.sources.row_parser import RowParser
-from armcal_online.sources.source import Incoming, Place, Source
-from armcal_online.sources.streams import Lines
+from armcal_online.sources import Incoming, Lines, Place, RowParser, Source, open_source
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row
 
@@ -44,31 +41,6 @@ def ids(found: list[Incoming]) -> list[str]:
     return [incoming.record_id for incoming in found]
 
 
-class SimulatedTime:
-    """Time that passes where it is slept through, and nowhere else."""
-
-    def __init__(self) -> None:
-        self.began, self.slept = time.time(), 0.0
-
-    def monotonic(self) -> float:
-        return self.slept
-
-    def time(self) -> float:
-        return self.began + self.slept
-
-    def sleep(self, seconds: float) -> None:
-        self.slept += seconds
-
-
-@pytest.fixture
-def simulated(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
-    """What sources wait by."""
-    passes = SimulatedTime()
-    for module in ("csv_file", "source"):
-        monkeypatch.setattr(f"armcal_online.sources.{module}.time", passes)
-    return passes
-
-
 def table(count: int, first: int = 1) -> str:
     return "\n".join([HEADER, *(row(i) for i in range(first, first + count))]) + "\n"
 
@@ -78,7 +50,7 @@ def test_a_csv_file_gives_what_the_csv_reader_gives(tmp_path: Path) -> None:
     header = f"{HEADER},approach1,payload_g,note"
     path.write_text("\n".join([header, *(f'{row(i)},{i % 3 - 1},{i}.5,"a, ""b"" {i}"' for i in range(1, 40))]))
     dataset: Dataset = CsvReader(CsvSettings(path=path)).read(request())
-    found = everything(CsvFile(path, rows(), "stop"))
+    found = everything(Lines(rows(), path))
     assert ids(found) == list(dataset.ids) and [r.source_row for r in found] == list(dataset.rows)
     for name, values in dataset.channels.items():
         assert [r.channels[name] for r in found] == values.tolist(), name
@@ -179,10 +151,10 @@ HOSTILE = [
 def test_a_file_with_anything_in_it_gives_its_good_rows_and_a_fault_for_each_bad_one(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     path.write_bytes(b"\n".join([HEADER.encode(), row(1).encode(), *HOSTILE, row(2).encode(), b""]))
-    found = everything(CsvFile(path, rows(), "stop"))
+    found = everything(Lines(rows(), path))
     assert [r.record_id for r in found if not r.fault] == ["p1", "p2"]
-    assert [r.source_row for r in found if r.fault] == [3, 4, 5, 7, 8, 9]
-    assert found[-1].source_row == 11
+    assert [r.source_row for r in found if r.fault] == [3, 4, 5, 2, 3, 4], "the header begins another text"
+    assert found[-1].source_row == 6
 
 
 @pytest.mark.slow
@@ -197,54 +169,52 @@ def test_bytes_at_random_never_raise(tmp_path: Path) -> None:
         path = tmp_path / f"{trial}.txt"
         path.write_bytes(data)
         with path.open("rb") as file:
-            for found in everything(Lines(file.fileno(), rows())):
+            for found in everything(Lines(rows(), file.fileno())):
                 json.dumps(found.as_dict(), allow_nan=False).encode()
 
 
-def test_a_growing_file_is_followed_and_half_a_line_waited_for(tmp_path: Path, simulated: SimulatedTime) -> None:
-    path = tmp_path / "poses.csv"
-    path.write_text(HEADER[:10])
-    source = CsvFile(path, rows(), "wait")
-    assert everything(source, 0.06) == []
-    with path.open("a") as file:
-        file.write(f"{HEADER[10:]}\n{row(1)}\n{row(2)[:-1]}")
-        file.flush()
-        assert ids(everything(source, 0.06)) == ["p1"]
-        file.write(f"{row(2)[-1:]}\n")
-        file.flush()
-        (second,) = everything(source, 0.06)
-    assert second.record_id == "p2" and second.channels["tracker.z"] == 0.03 and not source.ended
+def read(path: Path, positions: dict[str, int]) -> list[Incoming]:
+    source = Lines(rows(), path)
+    source.resume(positions)
+    return everything(source)
 
 
-def test_a_file_that_takes_the_place_of_another_is_read_from_its_beginning(
-    tmp_path: Path, simulated: SimulatedTime
-) -> None:
+def test_a_text_is_known_by_its_first_record_whatever_it_comes_through(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(table(5))
-    source = CsvFile(path, rows(), "wait")
-    first = everything(source, 0.06)
-    (tmp_path / "new").write_text(table(3, first=10))
-    os.replace(tmp_path / "new", path)
-    second = everything(source, 0.12)
-    path.write_text(table(2, first=20))
-    third = everything(source, 0.12)
-    assert ids(first + second + third) == ["p1", "p2", "p3", "p4", "p5", "p10", "p11", "p12", "p20", "p21"]
-    assert len({r.source_key for r in first + second + third}) == 3
-    again = CsvFile(path, rows(), "wait")
-    again.resume({first[0].source_key: 6})  # of another file of that name
-    assert ids(everything(again, 0.06)) == ["p20", "p21"]
+    first = read(path, {})
+    assert ids(first) == ["p1", "p2", "p3", "p4", "p5"] and len({r.source_key for r in first}) == 1
+    positions = {first[0].source_key: 4}
+    path.rename(tmp_path / "other.csv")
+    assert ids(read(tmp_path / "other.csv", positions)) == ["p4", "p5"]
+    assert ids(piped(table(5).encode(), positions=positions)) == ["p4", "p5"]
+    assert ids(read(tmp_path / "other.csv", {f"poses.csv#{first[0].source_key}": 6})) == [], "an earlier version's key"
+    path.write_text(table(3, first=10))
+    assert ids(read(path, positions)) == ["p10", "p11", "p12"]
+
+
+def test_the_header_once_more_begins_another_text(tmp_path: Path) -> None:
+    """As ``tail -F`` goes on where a log was rotated: after a restart the newer file comes alone."""
+    both = piped((table(5) + table(3, first=10)).encode())
+    assert ids(both) == ["p1", "p2", "p3", "p4", "p5", "p10", "p11", "p12"]
+    assert [r.source_row for r in both] == [2, 3, 4, 5, 6, 2, 3, 4] and len({r.source_key for r in both}) == 2
+    (tmp_path / "poses.csv").write_text(table(4, first=10))
+    progress = Progress()
+    for sequence, incoming in enumerate(both):
+        progress.take(incoming, sequence)
+    assert ids(read(tmp_path / "poses.csv", progress.rows)) == ["p13"]
 
 
 @pytest.mark.parametrize("taken", [0, 1, 4, 9])
 def test_a_file_is_gone_on_with_after_the_last_row_that_was_taken(tmp_path: Path, taken: int) -> None:
     path = tmp_path / "poses.csv"
     path.write_text(table(4) + "\nbad\n" + "\n".join(row(i) for i in range(5, 9)))
-    progress, first = Progress(), CsvFile(path, rows(), "stop")
+    progress, first = Progress(), Lines(rows(), path)
     found = [first.incoming(0.1) for _ in range(taken)]
     for sequence, incoming in enumerate(found):
         assert incoming is not None
         progress.take(incoming, sequence)
-    second = CsvFile(path, rows(), "stop")
+    second = Lines(rows(), path)
     second.resume(Progress.from_dict(json.loads(json.dumps(progress.as_dict()))).rows)
     both = [*(r for r in found if r is not None), *everything(second)]
     assert [r.record_id for r in both if not r.fault] == [f"p{i}" for i in range(1, 9)] and len(both) == 9
@@ -255,12 +225,12 @@ def test_a_file_that_cannot_be_used_is_refused_at_once(tmp_path: Path) -> None:
     for content, expected in {"": "it is empty", "a,b\n1,2\n": "no column for", "1,2\n": "expected a header"}.items():
         path.write_text(content)
         with pytest.raises(DataError, match=expected):
-            CsvFile(path, rows(), "stop")
+            Lines(rows(), path)
     with pytest.raises(InputError, match="no such file"):
         open_source(str(tmp_path / "gone.csv"), rows())
     with pytest.raises(InputError, match=r"Give socket \(.*\), - \(standard input\), or a CSV file"):
         open_source("udp:5005", rows())
-    with pytest.raises(InputError, match="not a regular file"):
+    with pytest.raises(InputError, match="it is a directory"):
         open_source(str(tmp_path), rows())
 
 
@@ -271,7 +241,7 @@ def test_what_is_remembered_of_files_does_not_grow() -> None:
     assert len(progress.rows) == MAX_FILES and max(progress.rows) == f"{3 * MAX_FILES - 1:06d}.csv"
 
 
-def piped(*pieces: bytes) -> list[Incoming]:
+def piped(*pieces: bytes, positions: Mapping[str, int] | None = None) -> list[Incoming]:
     reading, writing = os.pipe()
 
     def write() -> None:
@@ -282,7 +252,8 @@ def piped(*pieces: bytes) -> list[Incoming]:
 
     thread = threading.Thread(target=write)
     thread.start()
-    source = Lines(reading, rows())
+    source = Lines(rows(), reading)
+    source.resume(positions or {})
     found = everything(source, 2.0)
     thread.join()
     os.close(reading)
@@ -315,27 +286,9 @@ def test_memory_stays_flat_over_a_long_line_and_many_records(tmp_path: Path) -> 
         file.write(f"{HEADER}\n{'x' * 30_000_000}\n")
         file.writelines(f"{row(i)}\n" for i in range(5000))
     tracemalloc.start()
-    source, count = CsvFile(path, rows(), "stop"), 0
+    source, count = Lines(rows(), path), 0
     while source.incoming(0.0) is not None:
         count += 1
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert count == 5001 and peak < 12_000_000
-
-
-@pytest.mark.slow
-def test_a_pipe_in_the_place_of_a_followed_file_is_not_waited_for(tmp_path: Path) -> None:
-    """It counts as a file that is away; what takes its place is read."""
-    path = tmp_path / "poses.csv"
-    path.write_text(table(2))
-    source = CsvFile(path, rows(), "wait")
-    assert len(everything(source)) == 2
-    path.unlink()
-    os.mkfifo(path)
-    looking = threading.Thread(target=everything, args=(source,), daemon=True)
-    looking.start()
-    looking.join(5)
-    assert not looking.is_alive()
-    path.unlink()
-    path.write_text(table(3, 7))
-    assert len(everything(source)) == 3

@@ -18,7 +18,7 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import EXIT_BAD_INPUT, DataError
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ENVIRONMENT, ReadRequest, RequestedChannel, requested_channels
-from armcal.measure.tables import MAX_BYTES, is_cut
+from armcal.measure.tables import MAX_BYTES
 from armcal_mdh.model import MdhModel, MdhSettings, Row
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings
@@ -251,36 +251,6 @@ def test_refused_files(tmp_path: Path, name: str) -> None:
     content, expected = REFUSED_BYTES[name]
     message = refusal(tmp_path, content)
     assert all(part in message for part in expected), message
-
-
-@pytest.mark.parametrize(
-    ("style", "lost"), [("{:.3f}", 1), ("{:.6e}", 1), ("{!r}", 2)], ids=["fixed", "exponent", "shortest"]
-)
-def test_a_file_cut_in_its_last_number_is_refused(tmp_path: Path, style: str, lost: int) -> None:
-    heights = np.random.default_rng(4).uniform(100, 400, 60)
-    whole = table(*(row(i, z_mm=style.format(float(z))) for i, z in enumerate(heights, start=1)))[:-1]
-    assert len(read(tmp_path, whole)) == 60  # a last line without its end is common
-    last = len(whole) - whole.rindex(",") - 1
-    for cut in range(lost, last):
-        message = refusal(tmp_path, whole[:-cut])
-        assert "poses.csv:61, z_mm: " in message
-        assert f"the file ends in '{whole[-last:-cut]}' without a line end" in message or "expected a number" in message
-        if "expected a number" not in message:
-            assert len(read(tmp_path, whole[:-cut] + "\n")) == 60  # a line that ends is whole
-
-
-def test_ordinary_last_numbers_are_not_taken_for_cut_ones(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    refused = 0
-    for _ in range(300):  # one in a hundred numbers ends in two zeros, which are not written
-        cells = [str(round(float(z), 3)) for z in rng.uniform(100, 400, 30)]
-        refused += is_cut(cells)
-    assert refused <= 6
-    for cells in (["100", "90.5", *["80"] * 20, "7"], ["12.50"] * 9 + ["12"], ["1.25", "2.5", *["3.75"] * 20, "4.0"]):
-        assert not is_cut(cells)
-    whole = table(*(row(i, z_mm=f"{300 - i}.125") for i in range(1, 30)))
-    named = whole.replace(HEADER, HEADER.replace("pose_id", "id2") + ",note").replace("125\n", "125,0.1234\n")
-    assert len(read(tmp_path, named[:-3])) == 29  # nothing reads that column
 
 
 def test_the_byte_offset_is_that_in_the_file(tmp_path: Path) -> None:

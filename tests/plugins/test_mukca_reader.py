@@ -170,11 +170,6 @@ def test_only_a_sliding_joint_may_be_beyond_two_pi(tmp_path):
             "1,2,3\n30,20,-45\n",
             "hole_1.csv:2, column 1 (q1): found 30 rad, more than one turn (2 pi rad)",
         ),
-        (
-            "back__hole_1",
-            "0.1,0.2,0.312\n" * 11 + "0.1,0.2,0.3",
-            "hole_1.csv:12, column 3 (q3): the file ends in '0.3' without a line end",
-        ),
         ("back__hole_1", b"1,2,3\n1,\xff,3\n", "hole_1.csv:2: found the byte 0xff"),
         ("back__hole_1", b"1,2,3\n1,2\0,3\n", "hole_1.csv:2: found a NUL byte"),
     ],

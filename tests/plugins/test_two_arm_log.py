@@ -224,11 +224,6 @@ def test_creeping_joints_are_not_at_rest(tmp_path):
             {"arms": {"left": {"columns": [1, 2]}}},
             "2 columns for the arm left, which has 7 joints",
         ),
-        (
-            (text(motors(joints(12))).rstrip("\n").rpartition(".")[0] + ".1").encode(),
-            {},
-            "log.txt:12, column 14: the file ends in",
-        ),
         (b"1,\xff\n", {}, "log.txt:1: found the byte 0xff at offset 2, which is not UTF-8 text"),
         ("a,a\n" * 2, {"arms": {"left": {"columns": list("abcdefg")}}}, "found the column a 2 times"),
     ],

@@ -53,8 +53,7 @@ class BatchFunction:
         self._asked = 0
         self._compile_later: Callable[[], None] | None = None
         if choice != "interpreted" and compiler.find_compiler() is not None:
-            trial = partial(_trial, self, sample)
-            library, self._compile_later = _library(function, choice, iterated, trial)
+            library, self._compile_later = _library(function, choice, iterated)
             self._library = _agreeing(self, library, sample)
 
     @property
@@ -118,7 +117,7 @@ class BatchFunction:
 
 
 def _library(
-    function: ca.Function, choice: EvaluatorChoice, iterated: bool, trial: Callable[[], compiler.Trial]
+    function: ca.Function, choice: EvaluatorChoice, iterated: bool
 ) -> tuple[ctypes.CDLL | None, Callable[[], None]]:
     """The library if there is one by now, and what has it compiled for the next time."""
     driver = _driver(function) + (_iteration(function) if iterated else "")
@@ -133,8 +132,8 @@ def _library(
 
     library = compiler.load_cached(key, entries)
     if library is None and choice == "compiled":
-        library = quietly(partial(compiler.compile_now, key, source, entries, trial))
-    return library, partial(compiler.compile_in_background, key, source, trial)
+        library = quietly(partial(compiler.compile_now, key, source, entries))
+    return library, partial(compiler.compile_in_background, key, source)
 
 
 def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
@@ -213,12 +212,6 @@ void {_ITERATE}(long n, double **in, const long *stride) {{
 
 def _addresses(name: str, sizes: Sequence[int]) -> list[str]:
     return [f"{name} + {start} * LANES" for start in accumulate([0, *sizes[:-1]])]
-
-
-def _trial(batch: BatchFunction, sample: Sequence[Array]) -> compiler.Trial:
-    given = [np.ascontiguousarray(array[:, : c_source.LANES], dtype=float) for array in sample]
-    expected = np.concatenate(batch.interpreted(*given))
-    return compiler.Trial(_VECTOR, (np.concatenate(given), np.zeros_like(expected)), {1: expected}, _AGREEMENT)
 
 
 def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequence[Array]) -> Any:

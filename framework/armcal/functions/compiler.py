@@ -2,7 +2,7 @@
 
 A library's key covers the expression, the generator, the compiler, its flags and the processor, so that a
 stale or foreign one is never loaded. Its name ends in a digest of its content, so that a torn one is not loaded
-either; see ``library_build`` for what a library passes before it is there. ``ARMCAL_CACHE_DIR`` moves the cache;
+either. Who uses one compares its numbers with the interpreter's. ``ARMCAL_CACHE_DIR`` moves the cache;
 ``ARMCAL_CC=none`` turns compiling off, any other value names the compiler.
 """
 
@@ -18,9 +18,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -61,25 +60,6 @@ def library_key(text: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A call of a new library, made in a process of its own, and what it has to give.
-
-    Attributes:
-        arguments: integers (long), floats (double) and arrays, handed over by their address.
-    """
-
-    entry: str  # the C function
-    arguments: Sequence[int | float | Array]
-    expected: Mapping[int, Array]  # by the places of arguments, what these arrays have to hold afterwards
-    tolerance: float  # in units of the largest number of an array, or of 1
-
-    def as_json(self) -> dict[str, object]:
-        arguments = [one.ravel().tolist() if isinstance(one, np.ndarray) else one for one in self.arguments]
-        expected = {str(place): numbers.ravel().tolist() for place, numbers in self.expected.items()}
-        return {"entry": self.entry, "arguments": arguments, "expected": expected, "tolerance": self.tolerance}
-
-
 def agree(expected: Array, given: Array, tolerance: float) -> bool:
     """Whether numbers differ by no more than a share of the largest, or of 1; exactly where one is not finite."""
     scale = max(1.0, float(np.nanmax(np.abs(expected), initial=0.0)))
@@ -115,14 +95,9 @@ def _is_ours(path: Path) -> bool:
     )
 
 
-def compile_now(
-    key: str,
-    source: Callable[[], str],
-    entry_points: Sequence[str] = ENTRY_POINTS,
-    trial: Callable[[], Trial] | None = None,
-) -> ctypes.CDLL | None:
-    """Compile, try, cache and load; None when that fails."""
-    command = _prepare(key, source, trial)
+def compile_now(key: str, source: Callable[[], str], entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
+    """Compile, cache and load; None when that fails."""
+    command = _prepare(key, source)
     if command is None:
         return None
     with suppress(OSError, subprocess.SubprocessError):
@@ -130,9 +105,9 @@ def compile_now(
     return load_cached(key, entry_points)
 
 
-def compile_in_background(key: str, source: Callable[[], str], trial: Callable[[], Trial] | None = None) -> None:
+def compile_in_background(key: str, source: Callable[[], str]) -> None:
     """Start compiling for the next run; this one goes on, and may end first without stopping the compiler."""
-    command = _prepare(key, source, trial)
+    command = _prepare(key, source)
     if command is None:
         return
 
@@ -144,25 +119,23 @@ def compile_in_background(key: str, source: Callable[[], str], trial: Callable[[
     threading.Thread(target=wait, name="armcal-compile", daemon=True).start()
 
 
-def _prepare(key: str, source: Callable[[], str], trial: Callable[[], Trial] | None) -> list[str] | None:
-    """Write the source and give the command that compiles and tries it, and puts the result in place."""
+def _prepare(key: str, source: Callable[[], str]) -> list[str] | None:
+    """Write the source and give the command that compiles it and puts the result in place."""
     compiler = find_compiler()
     if compiler is None:
         return None
     directory = cache_directory()
-    # -I and -S: nothing but Python's own library is found, whatever lies in the working directory.
-    python = [sys.executable, "-I", "-S"]
     try:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         _forget_old(directory)
-        text, tried = source(), None if trial is None else trial().as_json()
-        job = {"compile": [compiler, *FLAGS], "python": python, "place": str(directory), "key": key, "trial": tried}
+        text, job = source(), {"compile": [compiler, *FLAGS], "place": str(directory), "key": key}
         build = Path(tempfile.mkdtemp(prefix=_BUILD, dir=directory))
         (build / "kernel.c").write_text(text, encoding="utf-8")
         (build / "job.json").write_text(json.dumps(job), encoding="utf-8")
     except OSError:
         return None
-    return [*python, library_build.__file__, "build", str(build)]
+    # -I and -S: nothing but Python's own library is found, whatever lies in the working directory.
+    return [sys.executable, "-I", "-S", library_build.__file__, str(build)]
 
 
 def _forget_old(directory: Path) -> None:

@@ -7,21 +7,20 @@ from types import FrameType
 from typing import Any, Self
 
 FINISH = (signal.SIGTERM, signal.SIGINT)
-STATUS = signal.SIGUSR1
 ROTATE = signal.SIGHUP
 
 
 class Signals:
-    """While it is entered: SIGTERM and SIGINT ask for the end, SIGUSR1 for the status, SIGHUP for a new file of events.
+    """While it is entered: SIGTERM and SIGINT ask for the end; SIGHUP, for a new file, ends nothing by itself.
 
     Outside the main thread there are none.
 
     Attributes:
-        finish, status, rotate: what was asked for.
+        finish, rotate: what was asked for.
     """
 
-    def __init__(self, numbers: Iterable[int] = (*FINISH, STATUS, ROTATE)) -> None:
-        self.finish = self.status = self.rotate = False
+    def __init__(self, numbers: Iterable[int] = (*FINISH, ROTATE)) -> None:
+        self.finish = self.rotate = False
         self.before: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
 
     def __enter__(self) -> Self:
@@ -38,7 +37,6 @@ class Signals:
 
     def take(self, number: int, frame: FrameType | None) -> None:
         self.finish |= number in FINISH
-        self.status |= number == STATUS
         self.rotate |= number == ROTATE
 
 

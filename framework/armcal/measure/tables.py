@@ -3,16 +3,11 @@
 A file is read once, line by line, and its columns become numbers a few hundred rows at a time, so that neither a long
 file nor a broken one takes much memory. A single bad cell is looked for only when a column fails. Where rows come one
 at a time, each is judged as it comes, by the same rules.
-
-A file may have been cut off: an interrupted copy, a full disk. A row that lost cells shows by their number. A last
-number that lost digits is a number still, which only those above it give away. That a file ends without a line end says
-nothing: many editors write it so.
 """
 
 import csv
 import hashlib
 import io
-import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,8 +33,6 @@ DECIMAL_COMMA = re.compile(r"\s*[+-]?[0-9]+,[0-9]+(?:[eE][+-]?[0-9]+)?\s*")
 
 _ROWS_AT_ONCE = 256  # small blocks stay in the processor's cache: faster than thousands
 _LIKELY = "\t;|,"  # The likeliest first: where columns are parted by semicolons, commas are decimal ones
-_PARTS = re.compile(r"\s*[+-]?[0-9]*(?:[.,](?P<decimals>[0-9]*))?(?:[eE][+-]?(?P<exponent>[0-9]+))?\s*")
-_FEWEST_OTHERS = 10
 _UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters", "metres", "m/s^2", "m/s2"} - {"1"})
 _NUMBER_AND_UNIT = re.compile(r"\s*[+-]?[0-9]*[.,]?[0-9]+\s*[^\W\d][\w/^]*\s*")
 
@@ -122,13 +115,11 @@ class Table:
     Attributes:
         first: its first row, a header or not.
         rest: the rows after it.
-        may_be_cut: whether the file ends without a line end.
     """
 
     path: Path
     first: Row
     rest: Iterator[Row]
-    may_be_cut: bool
     _digest: "hashlib._Hash"
 
     @property
@@ -157,9 +148,6 @@ class Table:
             DataError: with file, line and column.
         """
         rows, width = self.rest if has_header else chain([self.first], self.rest), len(self.first[1])
-        last = next((name for place, name in numbers if place == width - 1), None)
-        if self.may_be_cut and last is not None:
-            rows = whole_rows(rows, self.path, last)
         number = number or partial(number_of, self.path)
         lines, blocks, words = list[int](), [list[Array]() for _ in numbers], [list[str]() for _ in texts]
         while block := list(islice(rows, _ROWS_AT_ONCE)):
@@ -203,15 +191,13 @@ class LineTable:
         delimiter = delimiter_of(text)
         return cls(source, delimiter, tuple(_split(text, source, line, delimiter)))
 
-    def row(self, text: str, line: int) -> list[str] | None:
-        """The cells of a further line that is not blank; None for the header once more.
+    def row(self, text: str, line: int) -> list[str]:
+        """The cells of a further line that is not blank.
 
         Raises:
             DataError: it is not CSV, or has another number of cells than the header.
         """
         cells = _split(text, self.source, line, self.delimiter)
-        if tuple(cells) == self.header:
-            return None
         if len(cells) != len(self.header):
             _refuse_ragged(self.source, line, cells, len(self.header), True)
         return cells
@@ -269,26 +255,12 @@ def open_table(
     try:
         with input_file(path, most, what) if content is None else io.BytesIO(content) as file:
             rows = _rows(_text_lines(file, path, digest), path, delimiter)
-            last = _last_byte(file)
             first = next(rows, None)
             if first is None:
                 refuse(path, "it is empty.", empty)
-            yield Table(path, first, rows, may_be_cut(last), digest)
+            yield Table(path, first, rows, digest)
     except OSError as fault:
         refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
-
-
-def may_be_cut(end: bytes) -> bool:
-    """Whether text that ends so has no last line end."""
-    return end[-1:] not in (b"\n", b"\r", b'"')
-
-
-def _last_byte(file: BinaryIO) -> bytes:
-    size = file.seek(0, os.SEEK_END)
-    file.seek(max(size - 1, 0))
-    last = file.read(1)
-    file.seek(0)
-    return last
 
 
 def _text_lines(file: BinaryIO, path: Path, digest: "hashlib._Hash") -> Iterator[str]:
@@ -342,33 +314,3 @@ def number_of(path: Path | str, line: int | None, cell: str, name: str) -> float
     if isinstance(number, CellFault):
         refuse(path, number.text, number.hint, line, name)
     return number
-
-
-def whole_rows(rows: Iterator[Row], path: Path, column: str) -> Iterator[Row]:
-    """Rows of a file without a last line end, as they come; the last one is refused if its number lost its end."""
-    cells, line = list[str](), 0
-    for line, row in rows:
-        cells.append(row[-1])
-        yield line, row
-    if is_cut(cells):
-        text = f"the file ends in {cells[-1].strip()!r} without a line end, and every other number here has more digits"
-        hint = "Copy the whole file again, or remove this row. If nothing is missing, end its line."
-        refuse(path, f"{text}: was the file cut off?", hint, line, column)
-
-
-def is_cut(column: Sequence[str]) -> bool:
-    """Whether the last number of a column has fewer digits after the decimal sign, or in the exponent, than all others.
-
-    One fewer where zeros are written out (12.50); two where they are left out, as one number of a hundred ends in two
-    zeros. A whole number tells nothing among whole numbers.
-    """
-    last = _PARTS.fullmatch(column[-1]) if column and column[-1].strip() else None
-    others = [parts for cell in column[:-1] if cell.strip() and (parts := _PARTS.fullmatch(cell))]
-    if last is None or len(others) < _FEWEST_OTHERS:
-        return False
-    decimals = [parts["decimals"] or "" for parts in others]
-    fewest = min(map(len, decimals))
-    writes_zeros = fewest == max(map(len, decimals)) and any(digits.endswith("0") for digits in decimals)
-    lost = fewest - len(last["decimals"] or "")
-    lost_exponent = min(len(parts["exponent"] or "") for parts in others) - len(last["exponent"] or "")
-    return lost_exponent > 0 or lost > (0 if writes_zeros else 1)

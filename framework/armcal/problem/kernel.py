@@ -119,15 +119,6 @@ class Compiled(Backend):
         return partial(self._linearise, record.shape[1], _stride(record), *pointers, rest, MOST_PASSES)
 
 
-def trial(factor: Factor, interpreter: Backend) -> compiler.Trial:
-    """What a new library's ``armcal_linearise`` has to give, of a random block of records."""
-    (values, record, residual, jacobian), count = _sample(factor, interpreter), c_source.LANES
-    state = np.zeros((factor.state.numel(), count))
-    arrays = (values, record, state, np.zeros_like(residual), count, np.zeros_like(jacobian))
-    arguments = (count, count, *arrays, count, NEAR_REST_RAD, MOST_PASSES)
-    return compiler.Trial("armcal_linearise", arguments, {5: residual, 7: jacobian}, _AGREEMENT)
-
-
 def agree(factor: Factor, interpreter: Backend, compiled: Backend) -> bool:
     """Whether a library gives the interpreter's numbers; one that was compiled wrong is not used."""
     results = zip(_sample(factor, interpreter)[2:], _sample(factor, compiled)[2:], strict=True)
@@ -296,13 +287,13 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     text += f"{c_source.LANES} lanes" + c_source.generator_source()
     key = compiler.library_key(text)
 
-    source, expected = partial(kernel_source, own), partial(trial, own, interpreter)
+    source = partial(kernel_source, own)
     library = compiler.load_cached(key)
     if library is None:
         if choice == "auto" and records < WORTH_COMPILING_RECORDS:
-            quietly(lambda: compiler.compile_in_background(key, source, expected))
+            quietly(lambda: compiler.compile_in_background(key, source))
             return Kernel(factor, interpreter)
-        library = quietly(lambda: compiler.compile_now(key, source, trial=expected))
+        library = quietly(lambda: compiler.compile_now(key, source))
     if library is not None and agree(own, interpreter, compiled := Compiled(library)):
         return Kernel(factor, compiled, key)
     return Kernel(factor, interpreter)

@@ -32,9 +32,7 @@ from typing_extensions import override
 
 from armcal_online.mission.simulator import DAY_S, HOUR_S, Event, Mission, MissionOfDays, with_payload
 from armcal_online.running.session import Setup, opened
-from armcal_online.sources.csv_file import CsvFile
-from armcal_online.sources.row_parser import RowParser
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming, Lines, RowParser
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import SECTION as RECALIBRATE
 from armcal_online.tracking.settings import RecalibrateSettings
@@ -117,11 +115,11 @@ class PowerCutError(Exception):
     pass
 
 
-class CutSource(CsvFile):
+class CutSource(Lines):
     """Records until, after so many, the power goes: nothing is finished, nothing more is written."""
 
     def __init__(self, path: Path, rows: RowParser, count: float) -> None:
-        super().__init__(path, rows, "stop")
+        super().__init__(rows, path)
         self._count = count
 
     @override

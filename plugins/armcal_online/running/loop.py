@@ -18,8 +18,7 @@ from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
 
 from armcal_online.running.outputs import Outputs
-from armcal_online.sources.source import Incoming, Source
-from armcal_online.sources.streams import Sent
+from armcal_online.sources import Incoming, Sent, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 
 WAIT_S = 0.1  # how long a source is waited for before control and signals are looked at again
@@ -245,12 +244,6 @@ class Recalibration:
                 raise self._fault
             if signals.finish:
                 self.finishing = "It was asked to finish by a signal."
-            if signals.rotate:
-                signals.rotate = False
-                self._outputs.rotate()
-            if signals.status:
-                signals.status = False
-                self._write_status()
             if not self.finishing:
                 self.step(WAIT_S)
         self._outputs.retry()
@@ -354,7 +347,7 @@ class Recalibration:
         return {**reply, "fault": incoming.fault} if incoming.fault else reply
 
     def _take(self, incoming: Incoming) -> int:
-        earlier = None if self._source.keeps_records else self._state_replayer.progress.repeated(incoming)
+        earlier = self._state_replayer.progress.repeated(incoming)
         if earlier is not None:
             return earlier
         content = incoming.as_dict()

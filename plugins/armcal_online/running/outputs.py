@@ -95,10 +95,6 @@ class Outputs:
             if not reserve.exists() or reserve.stat().st_size < len(data):
                 write_whole(reserve, b"\0" * (len(data) + len(data) // 4 + 4096))
 
-    def rotate(self) -> None:
-        with contextlib.suppress(OSError):
-            self._events.doRollover()
-
     def alarm(self, sentence: str) -> None:
         self.event({"event": "alarm", "at": time.time(), "sentence": sentence})
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from armcal.estimate.online import Linearised
 
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, advice, per_cent, sure
 from armcal_online.tracking.hypotheses import CAUSES, LINK, Recent, Steps, spoken
 from armcal_online.tracking.settings import RecalibrateSettings

@@ -23,7 +23,7 @@ from armcal.estimate.online import Linearised, OnlineEstimator, normalised_innov
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import PluginRegistry, discover
 
-from armcal_online.sources.source import Incoming
+from armcal_online.sources import Incoming
 from armcal_online.tracking import events
 from armcal_online.tracking.belief import Belief, most_likely
 from armcal_online.tracking.decisions import EXPLAINED, Decision

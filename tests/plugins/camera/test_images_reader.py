@@ -243,13 +243,6 @@ def test_angles_of_a_flange_pose_are_named_and_not_taken_for_joints(folder: Path
     assert "rotation_vector" in caught.value.hint and "qw, qx, qy, qz" in caught.value.hint
 
 
-def test_flange_poses_cut_in_the_last_number_are_refused(folder: Path) -> None:
-    path = folder / "flange.txt"
-    path.write_text("1 0 0 0.112 0 1 0 0 0 0 1 0.312\n" * 11 + "1 0 0 0.112 0 1 0 0 0 0 1 0.3")
-    with pytest.raises(DataError, match=r":12, the last column: the file ends in '0\.3' without a line end"):
-        read(request_of(FLANGE), folder=folder, poses=path)
-
-
 def test_without_opencv_a_sentence_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(PluginError, match=r"pip install 'armcal\[camera\]'"):
