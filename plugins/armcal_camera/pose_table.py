@@ -31,8 +31,7 @@ from armcal.calibration.compensation import Options, nominal_arm
 from armcal.calibration.inverse import different
 from armcal.errors import DataError
 from armcal.io.plain_files import input_bytes, refuse, text_of
-from armcal.measure.checks import read_as
-from armcal.measure.layout import warned
+from armcal.measure.checks import read_as, warned
 from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal.measure.tables import is_number

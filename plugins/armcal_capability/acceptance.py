@@ -30,9 +30,8 @@ from armcal.errors import ConfigError, DataError, Location, noted
 from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile
 from armcal.estimate.start import BETTER, FAR, pose_words
 from armcal.io.folder import reserved
-from armcal.measure.checks import records_of
+from armcal.measure.checks import noticed, records_of
 from armcal.measure.csv_writer import csv_text
-from armcal.measure.environment import noticed
 from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry

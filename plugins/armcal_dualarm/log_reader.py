@@ -17,7 +17,7 @@ from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
-from armcal.measure.rests import Rest, StillSettings, rests
+from armcal.measure.rests import StillSettings, rests
 from armcal.measure.tables import Columns, is_missing, is_number, open_table
 from pydantic import Field, model_validator
 
@@ -188,7 +188,7 @@ class TwoArmLogReader:
     def _dataset(self, read: Columns, digest: str, joints: Array, values: Mapping[str, Array]) -> Dataset:
         """All rows, or the means of the rests among them."""
         s = self._settings
-        still = [Rest(i, i + 1) for i in range(len(read.lines))]
+        still = [slice(i, i + 1) for i in range(len(read.lines))]
         warnings: tuple[str, ...] = ()
         if s.still is not None:
             still = rests(joints, read.texts, values.get("time"), s.still)

@@ -23,9 +23,19 @@ from armcal.base.units import from_unit
 from armcal.errors import DataError, InputError, Location
 from armcal.io.lines import MAX_LINE_BYTES, LineCutter
 from armcal.io.plain_files import input_file, refuse, text_of
-from armcal.measure.column_match import Header, Plan, header_of, match_columns, refuse_missing, renamed
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import SAVE_AS_TEXT, LineTable, is_missing, number_of
+from armcal.measure.tables import (
+    SAVE_AS_TEXT,
+    Header,
+    LineTable,
+    Plan,
+    header_of,
+    is_missing,
+    match_columns,
+    number_of,
+    refuse_missing,
+    renamed,
+)
 from typing_extensions import override
 
 SOURCES = "socket (programs send to control.sock in --out), - (standard input), or a CSV file"

@@ -12,11 +12,23 @@ from armcal.base.settings import InputPath, Settings
 from armcal.base.units import DIMENSIONLESS, from_unit
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.errors import DataError, Location
-from armcal.measure.checks import read_as, require_records
-from armcal.measure.column_match import Column, Header, Plan, header_of, match_columns, renamed
-from armcal.measure.layout import Layout, set_aside, warned
+from armcal.measure.checks import Layout, read_as, require_records, set_aside, warned
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import DECIMAL_COMMA, CellFault, Row, Table, open_table, read_cell, with_point
+from armcal.measure.tables import (
+    DECIMAL_COMMA,
+    CellFault,
+    Column,
+    Header,
+    Plan,
+    Row,
+    Table,
+    header_of,
+    match_columns,
+    open_table,
+    read_cell,
+    renamed,
+    with_point,
+)
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 from typing_extensions import override

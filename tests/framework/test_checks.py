@@ -12,9 +12,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import from_unit
 from armcal.errors import EXIT_BAD_INPUT, DataError, InputError, Location
 from armcal.measure import checks
-from armcal.measure.checks import check_dataset, refuse_joint_count, set_aside_not_finite
+from armcal.measure.checks import Layout, check_dataset, layout_of, refuse_joint_count, set_aside_not_finite
 from armcal.measure.csv_writer import column_names, write_csv
-from armcal.measure.layout import Layout, layout_of
 from armcal.measure.reader import RequestedChannel
 from numpy.typing import NDArray
 

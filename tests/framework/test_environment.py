@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError
-from armcal.measure.environment import noticed
+from armcal.measure.checks import noticed
 
 
 def records(count: int = 10, extra: tuple[str, ...] = (), **channels: object) -> Dataset:

@@ -12,9 +12,14 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.errors import DataError
 from armcal.measure import checks
-from armcal.measure.checks import check_dataset, set_aside_not_finite, with_absent
-from armcal.measure.environment import warn_beyond_limits
-from armcal.measure.layout import Layout, layout_of
+from armcal.measure.checks import (
+    Layout,
+    check_dataset,
+    layout_of,
+    set_aside_not_finite,
+    warn_beyond_limits,
+    with_absent,
+)
 from armcal.measure.reader import ReadRequest, RequestedChannel, evidence_channels, requested_channels
 from armcal.testing.planar import Tip, planar_arms
 from armcal_contact.contacts import BallInSocket, BallInSocketSettings

@@ -9,7 +9,7 @@ import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import ArmcalError, DataError
 from armcal.measure.reader import ReadRequest, requested_channels
-from armcal.measure.rests import Rest, StillSettings, rests
+from armcal.measure.rests import StillSettings, rests
 from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
 from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
@@ -170,7 +170,7 @@ def plainly(joints, stops, spread):
         if (np.ptp(joints[:, start:stop], axis=1) <= spread).all():
             while stop < joints.shape[1] and (np.ptp(joints[:, start : stop + 1], axis=1) <= spread).all():
                 stop += 1
-            found.append(Rest(start, stop))
+            found.append(slice(start, stop))
             start = stop
         else:
             start += 1

@@ -17,9 +17,7 @@ from armcal.calibration.calibration_file import dump
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, DataError
-from armcal.measure.checks import refuse_joint_units
-from armcal.measure.environment import warn_beyond_limits
-from armcal.measure.layout import layout_of
+from armcal.measure.checks import layout_of, refuse_joint_units, warn_beyond_limits
 from armcal.measure.reader import requested_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment

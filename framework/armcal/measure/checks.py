@@ -5,20 +5,24 @@ records set aside or a warning added, or raises `DataError`. ``check_dataset`` r
 ``check_records`` those without which nothing works.
 """
 
+import difflib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
 
+from armcal.arm.assembly import Arm, shown_joint
+from armcal.arm.joints import Limits
+from armcal.arm.servo import SteppedEffect
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
-from armcal.base.units import split_suffix, to_unit
+from armcal.base.parameters import Parameters
+from armcal.base.units import UNITS, display_unit, split_suffix, to_unit
 from armcal.errors import DataError, Location
 from armcal.measure.groups import first_of_pose
-from armcal.measure.layout import Layout, joints_by_arm, layout_of, set_aside, warned
-from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel
+from armcal.measure.reader import CYCLE, ENVIRONMENT, Reader, ReadRequest, RequestedChannel
 from armcal.plugins import expecting, refuse
 
 FROZEN_RECORDS = 5  # So many identical measurements in a row, while the joints moved, and the instrument has stopped
@@ -34,6 +38,96 @@ _SMALL_DEGREES = (0.5, 6.3)
 _MAX_DEGREES = 720.0
 _LATEST_S, _HOTTEST_C = 1e11, 150.0
 _VARIES_AT_REST = ("time", "temperature")  # Channels that may differ between a record and its copy
+_APPROACH = ".approach."
+JUMP_RATIO = 50.0
+SHORTEST_JUMP_S = 600.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the channels of a dataset are, and what they were called in its source.
+
+    Attributes:
+        units: channel to the unit that its column declares; absent or SI means SI.
+        parts: channel to the measurements that need it; one that is absent belongs to the record as a whole.
+    """
+
+    joints: tuple[str, ...] = ()  # channels of commanded joint displacements, revolute (angle) and prismatic (length)
+    revolute: tuple[str, ...] = ()  # those of ``joints`` that turn, but not on and on
+    approach: tuple[str, ...] = ()  # channels of approach directions
+    measured: tuple[str, ...] = ()  # channels of measured values, ``instance.name``
+    columns: Mapping[str, str] = field(default_factory=dict)  # channel to its column in the source, for messages
+    units: Mapping[str, str] = field(default_factory=dict)
+    by_line: bool = False  # whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers
+    deviations: tuple[str, ...] = ()  # channels of their standard deviations
+    by_id: bool = False  # whether a record's id says where it stood, better than its row does
+    parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    of_points: frozenset[str] = frozenset()  # channels of points, of which a record may lack some but not all
+    evidence: frozenset[str] = frozenset()  # channels that only the verdict reads, which a record may lack
+
+    def column(self, channel: str) -> str:
+        return self.columns.get(channel, channel)
+
+    def place(self, dataset: Dataset, index: int) -> str:
+        if self.by_id:
+            return dataset.ids[index]
+        return f"{'line' if self.by_line else 'row'} {dataset.row(index)}"
+
+    def where(self, dataset: Dataset, index: int, channel: str | None = None) -> Location:
+        column = self.column(channel) if channel else None
+        if self.by_line:
+            return Location(dataset.source or None, line=dataset.row(index), field=column)
+        return dataset.where(index, column)
+
+    def shown(self, channel: str, si_value: float) -> str:
+        unit = self.units.get(channel, "1")
+        value = to_unit(si_value, unit) if unit in UNITS else si_value
+        return f"{value:.10g}" + ("" if unit == "1" else f" {unit}")
+
+
+def layout_of(
+    requested_channels: Sequence[RequestedChannel],
+    dataset: Dataset,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    *,
+    by_line: bool,
+) -> Layout:
+    """The layout of a dataset that was read for some wanted channels.
+
+    A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other channel that belongs
+    to an instance is measured; one that belongs to none (``payload``) describes the surroundings.
+    """
+    approach = [w.channel for w in requested_channels if _APPROACH in w.channel]
+    moved = {joint.channel for joints in joints_by_arm(requested_channels).values() for joint in joints}
+    joints = [w for w in requested_channels if w.channel in moved and dataset.has(w.channel)]
+    deviations = [w.channel for w in requested_channels if w.is_deviation]
+    measured = [
+        w.channel for w in requested_channels if "." in w.channel and w.channel not in {*moved, *approach, *deviations}
+    ]
+    return Layout(
+        joints=tuple(w.channel for w in joints),
+        revolute=tuple(w.channel for w in joints if w.dimension == "angle" and not w.is_endless),
+        approach=tuple(name for name in approach if dataset.has(name)),
+        measured=tuple(name for name in measured if dataset.has(name)),
+        columns=columns,
+        units=units,
+        by_line=by_line,
+        deviations=tuple(name for name in deviations if dataset.has(name)),
+        parts={w.channel: w.parts for w in requested_channels if w.parts and dataset.has(w.channel)},
+        of_points=frozenset(w.channel for w in requested_channels if w.is_of_point and dataset.has(w.channel)),
+        evidence=frozenset(w.channel for w in requested_channels if w.is_evidence),
+    )
+
+
+def joints_by_arm(requested_channels: Sequence[RequestedChannel]) -> dict[str, list[RequestedChannel]]:
+    """The channels of each arm's joints: those that have an approach."""
+    moved = {w.channel.replace(_APPROACH, ".", 1) for w in requested_channels if _APPROACH in w.channel}
+    arms: dict[str, list[RequestedChannel]] = {}
+    for w in requested_channels:
+        if w.channel in moved:
+            arms.setdefault(w.channel.rpartition(".")[0], []).append(w)
+    return arms
 
 
 def records_of(reader: Reader, request: ReadRequest) -> Dataset:
@@ -494,3 +588,121 @@ def _first_alike(dataset: Dataset, channels: Sequence[str]) -> Indices:
     first: dict[bytes, int] = {}
     firsts = (first.setdefault(data[i * step : (i + 1) * step], i) for i in range(len(dataset)))
     return np.fromiter(firsts, dtype=np.intp, count=len(dataset))
+
+
+def set_aside(dataset: Dataset, layout: Layout, faulty: Mapping[int, str], why: str, mend: str) -> Dataset:
+    """The dataset without some records (index to reason), and with a warning that says so."""
+    if not faulty:
+        return dataset
+    first = layout.place(dataset, min(faulty))
+    count = f"{len(faulty)} of {len(dataset)} records {'was' if len(faulty) == 1 else 'were'} set aside"
+    return warned(dataset.without(faulty), f"{count} because {why} (the first: {first}). {mend}")
+
+
+def warned(dataset: Dataset, text: str) -> Dataset:
+    place = f"{dataset.source}: " if dataset.source else ""
+    return replace(dataset, warnings=(*dataset.warnings, place + text))
+
+
+def require_conditions(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> None:
+    """Refuse records without a column that an effect reads, whatever reader they come from.
+
+    Raises:
+        DataError: with effect, column and source.
+    """
+    for channel in requested_channels:
+        if channel.effects and channel.required and not dataset.has(channel.channel):
+            raise DataError(
+                f"found no {channel.what}.",
+                where=dataset.where(field=channel.channel),
+                hint="Use a source that records it, or remove the effect.",
+            )
+
+
+def noticed(dataset: Dataset) -> Dataset:
+    """The dataset, with a warning for each unused column that looks like a misspelt one, and for a jump in time.
+
+    Raises:
+        DataError: a vector has some of its components only; the missing ones are not guessed.
+    """
+    for vector in ("gravity", "force", "torque", "payload"):
+        parts = [f"{vector}_{axis}" for axis in "xyz"]
+        missing = [name for name in parts if not dataset.has(name)]
+        if 0 < len(missing) < 3:
+            raise DataError(
+                f"{vector} has no {', '.join(missing)}.",
+                where=Location(dataset.source),
+                hint="Give all three components, 0 where there is none.",
+            )
+    known, texts = [name for name, _ in ENVIRONMENT], []
+    for column in dataset.extra:
+        split = split_suffix(column)
+        near = difflib.get_close_matches(split[0], known, n=1, cutoff=0.8) if split else []
+        if near:
+            texts.append(f"the column {column} is kept but not used: was {near[0]} meant?")
+    if dataset.has("time") and len(dataset) > 2:
+        # Pauses so long that arm or tracker may have been touched, or a clock set.
+        steps = np.diff(dataset.column("time"))
+        limit = max(JUMP_RATIO * float(np.median(steps)), SHORTEST_JUMP_S)
+        texts += [
+            f"{steps[i]:.0f} s pass between the records {dataset.ids[i]} and {dataset.ids[i + 1]}: if anything was "
+            "moved there, calibrate the parts on their own."
+            for i in np.flatnonzero(steps > limit)[:5]
+        ]
+    return replace(dataset, warnings=(*dataset.warnings, *texts))
+
+
+TOLERANCE = {"angle": 1e-3, "length": 1e-4}
+"""How far beyond a limit (rad, m) a command may be: limits are often rounded."""
+
+
+def own_limits(arm: Arm, parameters: Parameters) -> dict[str, Limits]:
+    """The limits of the model, by joint, of its commands (rad or m): zeros that effects state are taken off."""
+    zeros = dict.fromkeys(arm.joint_names, 0.0)
+    for name, effect in arm.effects.items():
+        for parameter, number in effect.zeros().items():
+            zeros[arm.joint_names[number - 1]] += parameters[f"{arm.name}.{name}.{parameter}"].nominal[0]
+    known = {joint.name: joint.limits for joint in arm.nominal_chain.joints if joint.limits is not None}
+    return {joint: (low - zeros[joint], high - zeros[joint]) for joint, (low, high) in known.items()}
+
+
+def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm], parameters: Parameters) -> Dataset:
+    """The dataset, with warnings of all joints that were commanded beyond their limits, or their pulse tables."""
+    of_limits, of_tables = list[str](), list[str]()
+    for name, arm in arms.items():
+        if not len(dataset) or not all(map(dataset.has, arm.command_channels)):
+            continue
+        commands = arm.joint_commands([dataset.column(channel) for channel in arm.command_channels])
+        joints = dict(zip(arm.joint_names, zip(arm.joint_dimensions, commands, strict=True), strict=True))
+        for joint, ends in own_limits(arm, parameters).items():
+            shown, (dimension, angles) = shown_joint(f"{name}.{joint}", arms), joints[joint]
+            of_limits += _beyond(f"{shown} is beyond its limits", angles, ends, TOLERANCE[dimension], dimension)
+        stepped = [effect.servos() for effect in arm.effects.values() if isinstance(effect, SteppedEffect)]
+        for index, (table, clock) in (servo for servos in stepped for servo in servos.items()):
+            shown, ends = shown_joint(f"{name}.{arm.joint_names[index]}", arms), (table.angles[0], table.angles[-1])
+            half = clock.tick / table.least_slope / 2  # a board rounds to whole counts
+            of_tables += _beyond(f"{shown} is beyond its pulse table", commands[index], ends, half, "angle")
+    texts = [f"{'; '.join(of_limits)}: check the joints' order, signs and units."] if of_limits else []
+    if of_tables:
+        texts.append(
+            f"{'; '.join(of_tables)}: pulses there are guessed along a straight line. Check the zero of the servo file "
+            "(libraries that count from 0 to 180 deg have the middle at 90), or measure the table that far."
+        )
+    return replace(dataset, warnings=(*dataset.warnings, *texts))
+
+
+def _beyond(what: str, values: Array, ends: Limits, tolerance: float, dimension: str) -> list[str]:
+    """A sentence of values (rad or m) beyond ends by more than a tolerance; none where none are."""
+    over = np.maximum(ends[0] - values, values - ends[1])  # below zero inside
+    over = np.nan_to_num(over, nan=-np.inf, neginf=-np.inf)
+    if not (count := int(np.sum(over > tolerance))):
+        return []
+    worst = to_unit(float(values[int(np.argmax(over))]), display_unit(dimension).name)
+    spread = span_text((float(np.nanmin(values)), float(np.nanmax(values))), dimension)
+    return [f"{what} {span_text(ends, dimension)} in {count} of {len(values)} records, at worst {worst:.4g} ({spread})"]
+
+
+def span_text(ends: Limits, dimension: str) -> str:
+    """Two ends (rad or m) as people read them: ``-100 to 100 deg``."""
+    unit = display_unit(dimension).name
+    return " to ".join(f"{to_unit(end, unit):.4g}" for end in ends) + f" {unit}"

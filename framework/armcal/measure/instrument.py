@@ -14,7 +14,7 @@ from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import ParameterBlock
 from armcal.base.se3 import Expression, Transform
 from armcal.base.settings import Settings
-from armcal.measure.measurement import Channel, Tie
+from armcal.measure.measurement import Channel, Measurement, Tie
 from armcal.plugins import refuse
 
 
@@ -104,8 +104,10 @@ class InstrumentSettings(Settings):
     arm: str | None = None
 
 
-class Instrument(ABC):
-    """A base for measurements that read something of one arm: channels, outputs and noise are all a subclass must say.
+class Instrument(Measurement, ABC):
+    """A base for measurements that read something of one arm.
+
+    ``channels``, ``outputs`` and ``noise`` (see ``Measurement``) are all that a subclass must say.
 
     Attributes:
         Settings: the class of its checked settings.
@@ -114,26 +116,15 @@ class Instrument(ABC):
     """
 
     Settings: ClassVar[type[_Settings]] = InstrumentSettings
+    arms: tuple[str, ...] = ()
 
     def __init__(self, settings: Any, arm_names: Sequence[str]) -> None:
         self.settings = settings
-        self.arms: tuple[str, ...] = (named_arm(settings.arm, arm_names),)
+        self.arms = (named_arm(settings.arm, arm_names),)
 
     def parameters(self) -> Sequence[ParameterBlock]:
         """Parameters of the instrument itself, under local names."""
         return ()
-
-    @abstractmethod
-    def channels(self) -> Sequence[Channel]:
-        """The measured numbers that it reads from a record."""
-
-    @abstractmethod
-    def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
-        """What each channel would read without noise (SI)."""
-
-    @abstractmethod
-    def noise(self) -> Sequence[float]:
-        """Standard deviation of each entry of the residual (m or rad)."""
 
     def residual(
         self, arms: Mapping[str, ArmState], measured: Mapping[str, Expression], values: Mapping[str, Expression]
@@ -208,12 +199,15 @@ class PointMeasurement(Protocol):
     """
 
     @property
+    @abstractmethod
     def points(self) -> Array:
         """What distinguishes the points (P x k), in a number or several each."""
 
+    @abstractmethod
     def point_channels(self) -> Sequence[Channel]:
         """What is read of one point."""
 
+    @abstractmethod
     def point_outputs(
         self, arms: Mapping[str, ArmState], values: Mapping[str, Expression], point: Expression
     ) -> Expression:
@@ -249,23 +243,8 @@ class Rendering(Protocol):
         """
 
 
-class PointInstrument(Instrument):
+class PointInstrument(Instrument, PointMeasurement):
     """A base for such instruments of one arm: points, their channels, outputs and noise are all that differs."""
-
-    @property
-    @abstractmethod
-    def points(self) -> Array:
-        """What distinguishes the points (P x k)."""
-
-    @abstractmethod
-    def point_channels(self) -> Sequence[Channel]:
-        """What is read of one point."""
-
-    @abstractmethod
-    def point_outputs(
-        self, arms: Mapping[str, ArmState], values: Mapping[str, Expression], point: Expression
-    ) -> Expression:
-        """What each of these would read without noise, of a point (k numbers)."""
 
     @abstractmethod
     def point_noise(self) -> Sequence[float]:

@@ -1,5 +1,6 @@
 """Measurements: factor types. Each says what one record constrains, as a residual in physical units."""
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
@@ -30,9 +31,11 @@ class Measurement(Protocol):
     def parameters(self) -> Sequence[ParameterBlock]:
         """Parameters of the instrument itself."""
 
+    @abstractmethod
     def channels(self) -> Sequence[Channel]:
         """The measured numbers it reads from a record."""
 
+    @abstractmethod
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> Mapping[str, Expression]:
         """What each channel would read without noise; empty for a contact that reads nothing."""
 
@@ -41,6 +44,7 @@ class Measurement(Protocol):
     ) -> Expression:
         """Measured minus predicted, or what a contact leaves open (n x 1, m or rad)."""
 
+    @abstractmethod
     def noise(self) -> Sequence[float]:
         """Standard deviation of each entry of the residual (m or rad)."""
 

@@ -1,9 +1,8 @@
-"""Readers: where datasets come from, the channels that they are asked for, and lists of record ids."""
+"""Readers: where datasets come from, and the channels that they are asked for."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 from armcal.arm.assembly import Arm
@@ -11,10 +10,8 @@ from armcal.arm.effects import JOINT_RATE, joint_rate
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.io.parallel import Report, unreported
-from armcal.io.plain_files import refuse
 from armcal.measure.instrument import PointMeasurement
 from armcal.measure.measurement import Measurement, noise_channels
-from armcal.measure.tables import open_table
 
 
 @dataclass(frozen=True)
@@ -182,27 +179,3 @@ def _arm_channels(arm: Arm, alone: bool, parts: tuple[str, ...]) -> Iterator[Req
 
 def _names(own: str, short: Sequence[str], alone: bool) -> tuple[str, ...]:
     return (own, *short) if alone else (own,)
-
-
-MAX_ID_LIST_BYTES = 1 << 26
-_ID_HEADER = "Give a header pose_id and an id a line."
-
-
-def read_ids(path: Path) -> tuple[str, ...]:
-    """The ids in a file, in its order.
-
-    Raises:
-        DataError: no such file, no text, no ids, or an id stands twice.
-    """
-    with open_table(path, "a list of ids", most=MAX_ID_LIST_BYTES, empty=_ID_HEADER) as table:
-        header = [cell.strip().lower() for cell in table.first[1]]
-        column = next((header.index(name) for name in ID_NAMES if name in header), None)
-        if column is None:
-            refuse(path, f"found the columns {', '.join(table.first[1])}.", _ID_HEADER)
-        ids = [cells[column].strip() for _, cells in table.rest if len(cells) > column]
-    if not ids:
-        refuse(path, "it lists no ids.", "Give an id a line below the header.")
-    twice = sorted({record for record in ids if ids.count(record) > 1}) if len(set(ids)) < len(ids) else []
-    if twice:
-        refuse(path, f"the id {twice[0]} stands twice.", "List each record once.")
-    return tuple(ids)

@@ -163,15 +163,7 @@ class StillSettings(Settings):
         return self
 
 
-@dataclass(frozen=True)
-class Rest:
-    """A stretch of rows, from ``start`` to before ``stop``."""
-
-    start: int
-    stop: int
-
-
-def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> list[Rest]:
+def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> list[slice]:
     """All stretches long enough in which no joint moves, in order.
 
     Args:
@@ -182,7 +174,7 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
     """
     breaks = breaks_of(joints, labels, time, settings)
     edges = [0, *np.flatnonzero(breaks).tolist(), joints.shape[1]]
-    stretches: list[Rest] = []
+    stretches: list[slice] = []
     for start, stop in pairwise(edges):
         part = np.nan_to_num(joints[:, start:stop])  # what is missing is so throughout, or there were a break
         # for each row that can begin a rest (the first ones), before which row the shortest such rest would end
@@ -193,7 +185,7 @@ def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, se
             passing = time[start:stop]
             stops = np.maximum(np.searchsorted(passing, passing + settings.window) + 1, np.arange(count) + 2)
             stops = stops[stops <= count]
-        stretches += [Rest(start + rest.start, start + rest.stop) for rest in _within(part, stops, settings.spread)]
+        stretches += [slice(start + rest.start, start + rest.stop) for rest in _within(part, stops, settings.spread)]
     return stretches
 
 
@@ -213,9 +205,9 @@ def breaks_of(joints: Array, labels: Sequence[Sequence[str]], time: Array | None
     return breaks
 
 
-def _within(joints: Array, stops: Indices, spread: float) -> list[Rest]:
+def _within(joints: Array, stops: Indices, spread: float) -> list[slice]:
     """The rests of a stretch without breaks: each begins where the shortest one holds, and goes on while it does."""
-    stretches: list[Rest] = []
+    stretches: list[slice] = []
     end = 0
     for start in np.flatnonzero((_spreads(joints, stops) <= spread).all(axis=0)).tolist():
         if start >= end:
@@ -227,7 +219,7 @@ def _within(joints: Array, stops: Indices, spread: float) -> list[Rest]:
                 if (high - low > spread).any():
                     break
                 end += 1
-            stretches.append(Rest(start, end))
+            stretches.append(slice(start, end))
     return stretches
 
 

@@ -21,9 +21,8 @@ from armcal.calibration.measured_point import MeasuredPoint, Point, measured_poi
 from armcal.calibration.tool_expression import APPROACH, ToolExpression
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.functions.batch_function import EvaluatorChoice
-from armcal.measure.checks import records_of
+from armcal.measure.checks import noticed, records_of
 from armcal.measure.csv_writer import write_csv
-from armcal.measure.environment import noticed
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels, surroundings
 from armcal.plugins import PluginRegistry
 from armcal.run.plan_poses import Workspace, workspace_of

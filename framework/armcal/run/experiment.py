@@ -45,11 +45,11 @@ from armcal.estimate.robust import NoiseSettings, weighed
 from armcal.estimate.simulation import SimulationRequest, Simulator
 from armcal.estimate.uncertainty import BootstrapSettings
 from armcal.estimate.validation import Split, folds, hold_out, split_by_id, split_by_label
-from armcal.measure.checks import records_of
-from armcal.measure.environment import noticed, require_conditions, warn_beyond_limits
+from armcal.measure.checks import noticed, records_of, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
 from armcal.measure.measurement import GroupedMeasurement
-from armcal.measure.reader import Reader, ReadRequest, evidence_channels, read_ids, requested_channels
+from armcal.measure.reader import Reader, ReadRequest, evidence_channels, requested_channels
+from armcal.measure.tables import read_ids
 from armcal.plugins import PluginRegistry, discover
 
 _AT = ("plan", "clearance")

@@ -17,8 +17,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.inverse import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, Location, ProblemError
-from armcal.measure.checks import records_of
-from armcal.measure.environment import TOLERANCE, own_limits, span_text
+from armcal.measure.checks import TOLERANCE, own_limits, records_of, span_text
 from armcal.measure.reader import Reader
 from armcal.plugins import PluginRegistry
 from armcal.run.experiment import Experiment, PlanSettings, clearance_check, with_data

@@ -21,8 +21,8 @@ from armcal.calibration.convert import nominal_values
 from armcal.calibration.rigid_chain import numeric_chain
 from armcal.errors import ConfigError, DataError, InputError, Location
 from armcal.measure.checks import records_of
-from armcal.measure.column_match import spellings
 from armcal.measure.reader import ENVIRONMENT, ReadRequest, RequestedChannel
+from armcal.measure.tables import spellings
 from armcal.plugins import PluginRegistry
 from armcal.report.numbers import plural
 from armcal.scaffold.plugin_files import check_length

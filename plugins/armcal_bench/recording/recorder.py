@@ -21,7 +21,7 @@ from armcal.devices.live import (
 )
 from armcal.errors import InputError
 from armcal.io.plain_files import write_over
-from armcal.measure.environment import warn_beyond_limits
+from armcal.measure.checks import warn_beyond_limits
 from armcal.plugins import refuse
 
 from armcal_bench.bench import Bench, closing
