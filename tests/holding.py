@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from armcal.arm.assembly import Arm
-from armcal.arm.loading import holding_function
+from armcal.arm.assembly import Arm, holding_function
 from armcal.base.arrays import Array
 
 

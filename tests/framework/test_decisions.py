@@ -14,8 +14,18 @@ import pytest
 from armcal.estimate.online import Gaussian
 from armcal_online.sources import Incoming
 from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, Decision, advice, log_odds_of, per_cent, sure
-from armcal_online.tracking.events import decided, last_good, record_name, spoken_time
+from armcal_online.tracking.decisions import (
+    KINDS,
+    LEVEL_ADVICE,
+    LEVELS,
+    Decision,
+    advice,
+    log_odds_of,
+    per_cent,
+    spoken_time,
+    sure,
+)
+from armcal_online.tracking.events import decided, last_good, record_name
 from armcal_online.tracking.hypotheses import Kind
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.state import REMEMBERED, Arrival, Health, State, remembering, troubled

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import oracle
 import pytest
-from armcal.arm.loading import site_loads
+from armcal.arm.assembly import site_loads
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.diagnose.causes import Functions

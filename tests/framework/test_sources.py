@@ -9,6 +9,7 @@ import random
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -202,7 +203,7 @@ def test_the_header_once_more_begins_another_text(tmp_path: Path) -> None:
     progress = Progress()
     for sequence, incoming in enumerate(both):
         progress.take(incoming, sequence)
-    assert ids(read(tmp_path / "poses.csv", progress.rows)) == ["p13"]
+    assert ids(read(tmp_path / "poses.csv", progress.positions)) == ["p13"]
 
 
 @pytest.mark.parametrize("taken", [0, 1, 4, 9])
@@ -215,7 +216,7 @@ def test_a_file_is_gone_on_with_after_the_last_row_that_was_taken(tmp_path: Path
         assert incoming is not None
         progress.take(incoming, sequence)
     second = Lines(rows(), path)
-    second.resume(Progress.from_dict(json.loads(json.dumps(progress.as_dict()))).rows)
+    second.resume(Progress.from_dict(json.loads(json.dumps(asdict(progress)))).positions)
     both = [*(r for r in found if r is not None), *everything(second)]
     assert [r.record_id for r in both if not r.fault] == [f"p{i}" for i in range(1, 9)] and len(both) == 9
 
@@ -238,7 +239,7 @@ def test_what_is_remembered_of_files_does_not_grow() -> None:
     progress = Progress()
     for i in range(3 * MAX_FILES):
         progress.take(Incoming("p", {}, {}, 0.0, f"{i:06d}.csv", 5), i)
-    assert len(progress.rows) == MAX_FILES and max(progress.rows) == f"{3 * MAX_FILES - 1:06d}.csv"
+    assert len(progress.positions) == MAX_FILES and max(progress.positions) == f"{3 * MAX_FILES - 1:06d}.csv"
 
 
 def piped(*pieces: bytes, positions: Mapping[str, int] | None = None) -> list[Incoming]:

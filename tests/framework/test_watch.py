@@ -195,7 +195,7 @@ def test_what_no_longer_runs_is_never_shown_as_nominal_and_go_on(
     """Killed, stopped by a fault, ended or stuck, whatever it wrote last: since when, and what to do."""
     with folder_of(tmp_path / "x", runs, *BEFORE, **status) as folder:
         shown = CliRunner().invoke(cli, ["watch", str(folder), "--once"]).output
-        state = json.loads(CliRunner().invoke(cli, ["watch", str(folder), "--once", "--json"]).output)
+        state = present(folder)
     assert state["life"] == life and says in (state["over"] or "")
     assert ("Go on." in shown) == (life == "running") and (AFTER_THE_END in shown) == (life != "running")
     assert ("(it was nominal)" in shown) == (life in ("killed", "stopped", "hangs"))
@@ -243,7 +243,6 @@ def test_bad_calls_are_told(tmp_path: Path) -> None:
         ([str(path)], "it is a file"),
         ([str(tmp_path / "none")], "there is no such folder"),
         ([str(tmp_path / "none"), "--once"], "there is no such folder"),
-        ([str(tmp_path), "--json"], "only for --once"),
         ([str(tmp_path), "--port", "70000"], "70000"),
     ):
         result = CliRunner().invoke(cli, ["watch", *arguments])

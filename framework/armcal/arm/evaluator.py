@@ -37,19 +37,6 @@ _SHIFTED_TO = 0.1  # Where the potential is not convex, its lowest eigenvalue is
 Evaluate = Callable[[Indices], tuple[Array, Array]]  # F (n_d x k) and S (k x n_d x n_d) of some records at their states
 
 
-@dataclass(frozen=True)
-class Settled:
-    """Where states came to rest."""
-
-    at_rest: Mask  # whether each did, within what springs may give (N)
-    held: Mask  # whether the springs hold the arm there (N)
-
-    @property
-    def sound(self) -> Mask:
-        """Both (N)."""
-        return self.at_rest & self.held
-
-
 def by_passes(following: Callable[[], Array], state: Array, rest: float = REST_RAD) -> Mask:
     """Replace states (n_d x N), in place, by what ``following`` gives of them until none moves more than ``rest``.
 
@@ -104,8 +91,8 @@ def refusal(which: str, springs: Sequence[str], state: Array, slope: Array, far:
     return NotConvergedError(f"the elastic equilibrium of {which} {text}", hint=hint)
 
 
-def settle(evaluate: Evaluate, state: Array) -> Settled:
-    """Bring states (n_d x N) to equilibria that the springs hold, in place, and say of which this came true.
+def settle(evaluate: Evaluate, state: Array) -> Mask:
+    """Bring states (n_d x N) to equilibria that the springs hold, in place, and say of which this came true (N).
 
     Newton's method where I - S is positive. Elsewhere its lowest eigenvalue is shifted above zero, so that a step leads
     down the potential energy and away from equilibria that are not held [Nocedal2006], as an arm that is let go would.
@@ -132,7 +119,7 @@ def settle(evaluate: Evaluate, state: Array) -> Settled:
         if not len(moving):
             break
     at_rest = (lengths < NEAR_REST_RAD) & (np.abs(state).max(axis=0, initial=0.0) <= MOST_DEFLECTION)
-    return Settled(at_rest, held)
+    return np.asarray(at_rest & held)
 
 
 ManyRecords = Callable[..., list[Array]]  # A CasADi function over columns: ``InterpretedFunction`` or ``BatchFunction``
@@ -262,7 +249,7 @@ class Evaluator:
                 moving = np.flatnonzero(~at_rest)
                 begun = before[:, part][:, moving]
                 begun[:, ~(np.abs(begun).max(axis=0) <= MOST_DEFLECTION)] = 0.0
-                at_rest[moving] = settle(self._slopes(values, own[:, moving], begun), begun).sound
+                at_rest[moving] = settle(self._slopes(values, own[:, moving], begun), begun)
                 here[:, moving] = begun
             sound[part] = at_rest
         return sound

@@ -36,13 +36,6 @@ class BoundFunction:
                     bind(place, array.data)
 
 
-class _Memory(threading.local):
-    """Each thread's own, by the number of records at once."""
-
-    def __init__(self) -> None:
-        self.bound: dict[int, BoundFunction] = {}
-
-
 class InterpretedFunction:
     """A CasADi function of column vectors (dense inputs and outputs) over many records.
 
@@ -50,7 +43,8 @@ class InterpretedFunction:
     """
 
     def __init__(self, function: ca.Function, shared: int = 0) -> None:
-        self.function, self._shared, self._memory = function, shared, _Memory()
+        self.function, self._shared = function, shared
+        self._memory = threading.local()  # each thread's own, by the number of records at once
         self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]
 
     def __call__(self, *inputs: Array) -> list[Array]:
@@ -70,9 +64,10 @@ class InterpretedFunction:
         return outputs
 
     def _evaluated(self, inputs: Sequence[Array], records: int) -> list[Array]:
-        bound = self._memory.bound.get(records)
+        own = self._memory.__dict__
+        bound: BoundFunction | None = own.get(records)
         if bound is None:
-            bound = self._memory.bound[records] = BoundFunction(self.function, records, self._shared)
+            bound = own[records] = BoundFunction(self.function, records, self._shared)
         for array, source in zip(bound.inputs, inputs, strict=True):
             array[...] = source.T
         bound.evaluate()

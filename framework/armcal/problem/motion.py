@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armcal.arm.assembly import command_channels
-from armcal.arm.loading import SiteLoads, site_loads
+from armcal.arm.assembly import SiteLoads, command_channels, site_loads
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, holding_function
 from armcal.arm.joints import unknown_joint
-from armcal.arm.loading import holding_function
 from armcal.arm.statics import Environment
 from armcal.base.arrays import Array
 from armcal.devices.clock import Clock

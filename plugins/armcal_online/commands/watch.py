@@ -23,9 +23,9 @@ import click
 from armcal.base.config_text import as_line
 from armcal.cli.console import say
 from armcal.errors import ArmcalError, InputError, Location
-from armcal.version import JSON_SCHEMA
 
-from armcal_online.running.situation import EARLIER, EVENTS, present, when
+from armcal_online.running.situation import EARLIER, EVENTS, present
+from armcal_online.tracking.decisions import spoken_time
 
 DEFAULT_PORT = 8642
 _HOST = "127.0.0.1"
@@ -40,21 +40,14 @@ _LISTED = ("event", "sequence", "at", "kind", "to", "sentence", "do", "confirm",
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--port", type=click.IntRange(0, 65535), default=DEFAULT_PORT, show_default=True, help="0: any free one.")
 @click.option("--once", is_flag=True, help="Print the present state and end.")
-@click.option("--json", "as_json", is_flag=True, help="With --once: as JSON.")
-def watch(folder: Path, port: int, once: bool, as_json: bool) -> None:
+def watch(folder: Path, port: int, once: bool) -> None:
     """Show a recalibration live, as a page in the browser. DIR is its folder, which is only read."""
     where, hint = Location(str(folder)), "Give what armcal recalibrate was given as --out."
     if not folder.is_dir():
         wrong = "it is a file, expected the folder of a recalibration" if folder.exists() else "there is no such folder"
         raise InputError(f"{wrong}.", where=where, hint=hint)
-    if as_json and not once:
-        hint = "Programs read status.json and events.jsonl in the folder itself."
-        raise InputError("it is only for --once.", where=Location("--json"), hint=hint)
-    now = present(folder)
-    if as_json:
-        click.echo(json.dumps({**JSON_SCHEMA, **now}, indent=2))
-    elif once:
-        for line in first_screen(now):
+    if once:
+        for line in first_screen(present(folder)):
             say(line)
     else:
         _serve(WatchServer(folder, port))
@@ -105,7 +98,7 @@ def _record(record: Mapping[str, Any] | None) -> str:
     if not record:
         return ""
     at = record.get("at")
-    return ", ".join(filter(None, (record.get("id"), at and when(at), f"entry {record['sequence']}")))
+    return ", ".join(filter(None, (record.get("id"), at and spoken_time(at), f"entry {record['sequence']}")))
 
 
 def newest_events(folder: Path) -> dict[str, list[dict[str, Any]]]:

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 from zlib import crc32
 
@@ -38,7 +38,7 @@ class Progress:
 
     records: int = 0  # how many records were journalled, from the beginning
     paused: bool = False  # whether records are passed over
-    rows: dict[str, int] = field(default_factory=dict)  # the last one taken, by file
+    positions: dict[str, int] = field(default_factory=dict)  # the last row taken, by file
     recent: dict[str, int] = field(default_factory=dict)  # sequence numbers of the last records of streams
 
     def take(self, incoming: Incoming, sequence: int) -> None:
@@ -46,9 +46,9 @@ class Progress:
         self.records += 1
         if incoming.source_key:
             key = incoming.source_key
-            self.rows[key] = max(self.rows.get(key, 0), incoming.source_row)
-            if len(self.rows) > MAX_FILES:
-                del self.rows[next(iter(self.rows))]
+            self.positions[key] = max(self.positions.get(key, 0), incoming.source_row)
+            if len(self.positions) > MAX_FILES:
+                del self.positions[next(iter(self.positions))]
         elif not incoming.fault:
             self.recent[_mark(incoming)] = sequence
             if len(self.recent) > RECENT:
@@ -58,19 +58,11 @@ class Progress:
         """Under which sequence number the same record of a stream was taken not long ago."""
         return None if incoming.source_key or incoming.fault else self.recent.get(_mark(incoming))
 
-    def as_dict(self) -> dict[str, Any]:
-        return {
-            "records": self.records,
-            "paused": self.paused,
-            "positions": dict(self.rows),
-            "recent": dict(self.recent),
-        }
-
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Progress:
-        """What ``as_dict`` wrote."""
-        rows, recent = dict(content["positions"]), dict(content["recent"])
-        return cls(int(content["records"]), bool(content["paused"]), rows, recent)
+        """What ``asdict`` made."""
+        positions, recent = dict(content["positions"]), dict(content["recent"])
+        return cls(int(content["records"]), bool(content["paused"]), positions, recent)
 
 
 def _mark(incoming: Incoming) -> str:
@@ -108,7 +100,7 @@ class StateReplayer:
         self.progress = Progress()
 
     def checkpoint(self) -> dict[str, Any]:
-        return {"state": self._session.snapshot(), "progress": self.progress.as_dict()}
+        return {"state": self._session.snapshot(), "progress": asdict(self.progress)}
 
     def restore(self, checkpoint: Mapping[str, Any] | None, sequence: int) -> None:
         """Take up the state of a checkpoint; without one, that of the beginning."""
@@ -199,7 +191,7 @@ class Recalibration:
         pace: Pace,
         since_checkpoint: int = 0,
     ) -> None:
-        self._source, self._journal, self.session = source, journal, session
+        self._source, self.journal, self.session = source, journal, session
         self._state_replayer, self._outputs, self._control, self._pace = state_replayer, outputs, control, pace
         self._is_written = False
         self._since_calibration = 0
@@ -208,10 +200,6 @@ class Recalibration:
         self.sequence = journal.sequence
         self.finishing = ""
         self._fault: Exception | None = None  # of a record that a program sent
-
-    @property
-    def journal(self) -> Journal:
-        return self._journal
 
     @property
     def paused(self) -> bool:
@@ -297,7 +285,7 @@ class Recalibration:
         before = self.session.snapshot()
         self._state_replayer.go_back(sequence)
         try:
-            self.sequence = self._journal.record(ROLLBACK, {"to": sequence})
+            self.sequence = self.journal.record(ROLLBACK, {"to": sequence})
         except BaseException:
             self.session.restore(before)
             raise
@@ -351,25 +339,25 @@ class Recalibration:
         if earlier is not None:
             return earlier
         content = incoming.as_dict()
-        self.sequence = self._journal.record(RECORD, content)
+        self.sequence = self.journal.record(RECORD, content)
         events = self._state_replayer.apply(self.sequence, RECORD, content)
         self._since_calibration += 1
         self._since_checkpoint += 1
         for event in events:
             self._outputs.event(event)
             if event["event"] in NOTED:
-                self._journal.note(event["event"], finite(event))
+                self.journal.note(event["event"], finite(event))
         if any(event["event"] == "decision" for event in events):
             self.write_calibration()
         return self.sequence
 
     def _command(self, kind: str) -> None:
-        self.sequence = self._journal.record(kind, {"at": time.time()})
+        self.sequence = self.journal.record(kind, {"at": time.time()})
         self._state_replayer.apply(self.sequence, kind, {})
         self._outputs.event({"event": "control", "sequence": self.sequence, "at": time.time(), "command": kind})
 
     def _checkpoint(self) -> None:
-        self._journal.put_checkpoint(self._state_replayer.checkpoint())
+        self.journal.put_checkpoint(self._state_replayer.checkpoint())
         self._since_checkpoint = 0
 
     def _write_status(self) -> None:

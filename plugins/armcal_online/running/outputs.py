@@ -126,19 +126,16 @@ class Outputs:
         try:
             write()
         except OSError as fault:
-            self._failed(what, broken.format(fault.strerror))
+            self._silent_until[what] = time.monotonic() + RETRY_S
+            if what not in self._troubled:
+                self._troubled.add(what)
+                self._report(what, broken.format(fault.strerror))
             return False
         self._silent_until.pop(what, None)
         if what in self._troubled:
             self._troubled.discard(what)
             self._report(what, mended)
         return True
-
-    def _failed(self, what: str, sentence: str) -> None:
-        self._silent_until[what] = time.monotonic() + RETRY_S
-        if what not in self._troubled:
-            self._troubled.add(what)
-            self._report(what, sentence)
 
     def _report(self, what: str, sentence: str) -> None:
         """An alarm, which is not written to the file that is in trouble itself."""

@@ -20,7 +20,7 @@ from armcal.plugins import PluginRegistry
 from armcal_online.running.loop import RECORD, STARTED, Pace, Recalibration, StateReplayer
 from armcal_online.running.outputs import CALIBRATION, RESERVE, Outputs
 from armcal_online.running.situation import EARLIER, EVENTS, SOCKET, STATUS
-from armcal_online.sources import Incoming, Source
+from armcal_online.sources import RowParser, Sent, Source
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import load_settings
 
@@ -46,7 +46,6 @@ class Setup:
     calibration: Path  # the file it begins from
     stream: StandardOutput = field(default_factory=lambda: StandardOutput(None))
     pace: Pace = field(default_factory=Pace)  # how often other things are
-    total_bytes: int | None = None  # how large the journal may grow; None: as the settings have it
     kept: Mapping[str, Any] | None = None
 
 
@@ -63,11 +62,12 @@ def opened(setup: Setup, session: Recalibrator, source: Source) -> Iterator[Reca
     with ExitStack() as stack:
         stack.callback(source.close)
         header = _header(setup, session)
-        total = setup.total_bytes or session.settings.journal.total_bytes
+        # Nothing of the past goes for a roll-back after the end.
+        total = session.settings.journal.total_bytes if setup.kept is None else 1 << 62
         journal = stack.enter_context(Journal(setup.folder, header, total))
         state_replayer = StateReplayer(session, journal.until, str(journal.path))
         left = _recover(setup, journal, state_replayer, header)
-        source.resume(state_replayer.progress.rows)
+        source.resume(state_replayer.progress.positions)
         outputs = Outputs(setup.folder, setup.stream)
         stack.callback(outputs.close)
         resumed = not journal.is_new
@@ -120,14 +120,6 @@ def _recover(setup: Setup, journal: Journal, state_replayer: StateReplayer, head
     return journal.sequence - checkpoint.sequence
 
 
-class _NoRecords(Source):
-    keeps_records = True
-    ended = True
-
-    def incoming(self, wait_s: float) -> Incoming | None:
-        return None
-
-
 def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Mapping[str, Any]:
     """Set the estimate in the folder of a recalibration that does not run back; see ``rolled_back``.
 
@@ -141,13 +133,9 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         if isinstance(to, int):
             journal.until(to)
         header = journal.header
-    setup = Setup(
-        folder=folder,
-        calibration=Path(str(header.get("path", ""))),
-        total_bytes=1 << 62,  # nothing of the past goes for this
-        kept=header,
-    )
-    with opened(setup, _kept_session(header, journal.path, registry), _NoRecords()) as loop:
+    session = _kept_session(header, journal.path, registry)
+    setup = Setup(folder, Path(str(header.get("path", ""))), kept=header)
+    with opened(setup, session, Sent(RowParser(session.request, {}))) as loop:
         reply = rolled_back(loop, to)
         loop.finishing = "The estimate was set back after the end."
         loop.run()

@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 from armcal.errors import InputError, Location
 from armcal.io.json_server import JsonClient
 
-from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, sure_to
+from armcal_online.tracking.decisions import KINDS, LEVEL_ADVICE, LEVELS, spoken_time, sure_to
 
 STATUS, SOCKET = "status.json", "control.sock"
 EVENTS, EARLIER = "events.jsonl", "events.jsonl.1"
@@ -193,7 +192,7 @@ def present(folder: Path) -> dict[str, Any]:
     over = None
     if life in _OVER:
         at = status.get("at")
-        began = f"{_OVER[life]} at {when(at)}" if at else _OVER[life]
+        began = f"{_OVER[life]} at {spoken_time(at)}" if at else _OVER[life]
         why = f": {status['fault']}" if life == "stopped" else "."
         over = f"{began}{why} Nothing follows the arm until it is started again; a roll-back works all the same."
         bad = status.get("level") in LEVELS[2:]
@@ -210,8 +209,3 @@ def _life(status: Event, runs: bool | None) -> str:
     if runs is False:
         return "killed"
     return "hangs" if silent else "running"
-
-
-def when(at: float) -> str:
-    """A time in words: UTC where it may be one since 1970."""
-    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC" if 1e8 < at < 1e11 else f"{at:g} s"

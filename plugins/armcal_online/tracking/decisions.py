@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 if TYPE_CHECKING:  # the watcher reads this table, and has no need of numpy
@@ -246,3 +247,8 @@ def advice(kind: str, names: Mapping[str, Any]) -> dict[str, str]:
     """``do`` and ``confirm`` of a decision, with the names of its joints, instrument and records."""
     texts = KINDS[kind]
     return {"do": texts.do.format_map(names), "confirm": texts.confirm.format_map(names)}
+
+
+def spoken_time(at: float) -> str:
+    """A time as people read it: unix seconds as a date (1973 to 5138), seconds of another clock as they are."""
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC" if 1e8 < at < 1e11 else f"at {at:g} s"

@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 from armcal.estimate.online import Linearised
 
 from armcal_online.sources import Incoming
-from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, advice, per_cent, sure
+from armcal_online.tracking.decisions import LEVEL_ADVICE, LEVELS, Decision, advice, per_cent, spoken_time, sure
 from armcal_online.tracking.hypotheses import CAUSES, LINK, Recent, Steps, spoken
 from armcal_online.tracking.settings import RecalibrateSettings
 from armcal_online.tracking.start import FilterSetup
@@ -17,7 +16,6 @@ from armcal_online.tracking.state import Arrival, Health, State
 from armcal_online.tracking.window_evidence import SHOWN, TipError
 
 _MOST_LOG_ODDS = 700.0
-_FIRST_DATE, _LAST_DATE = 1e8, 1e11  # unix seconds (1973 to 5138); other times are of a clock that began elsewhere
 
 
 def started(
@@ -164,13 +162,6 @@ def record_name(sequence: int, arrival: Arrival | None) -> str:
     if arrival is None:
         return f"entry {sequence}"
     return f"record {arrival.record_id} ({spoken_time(arrival.at)}, entry {sequence})"
-
-
-def spoken_time(at: float) -> str:
-    """A time as people read it: unix seconds as a date, seconds of another clock as they are."""
-    if not _FIRST_DATE < at < _LAST_DATE:
-        return f"at {at:g} s"
-    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _names(good: Arrival | None, calm: int) -> dict[str, Any]:
