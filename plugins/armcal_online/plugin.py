@@ -3,17 +3,17 @@
 from armcal.hooks import Register, hookimpl
 
 _COMMANDS = {
-    "recalibrate": ("recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
-    "control": ("recalibrate:control", "Query or command a running recalibration."),
-    "watch": ("watch:watch", "Show a recalibration live, in the browser."),
-    "mission": ("mission:mission", "Simulate a mission, recalibrate over it, compare that with its truth."),
+    "recalibrate": ("commands.recalibrate:recalibrate", "Keep a calibration true, record by record, as they come."),
+    "control": ("commands.recalibrate:control", "Query or command a running recalibration."),
+    "watch": ("commands.watch:watch", "Show a recalibration live, in the browser."),
+    "mission": ("mission.mission:mission", "Simulate a mission, recalibrate over it, compare that with its truth."),
 }
 
 
 @hookimpl
 def armcal_register_commands(register: Register) -> None:
     for name, (target, summary) in _COMMANDS.items():
-        register(name, f"armcal_online.commands.{target}", summary)
+        register(name, f"armcal_online.{target}", summary)
 
 
 @hookimpl

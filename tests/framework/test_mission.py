@@ -19,7 +19,6 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal_online.commands.mission import mission_figure
 from armcal_online.mission.mission import (
     ErrorCurve,
     MissionLog,
@@ -28,6 +27,7 @@ from armcal_online.mission.mission import (
     curve_text,
     error_curve,
     figures,
+    mission_figure,
     random_poses,
 )
 from armcal_online.mission.simulator import DAY_S, Mission, with_payload
@@ -335,8 +335,8 @@ def test_a_missing_or_broken_library_is_told_before_the_mission(
         assert name == "matplotlib"
         raise fault
 
-    monkeypatch.setattr("armcal_online.commands.mission.import_module", failing)
-    monkeypatch.setattr("armcal_online.commands.mission.run_mission", lambda *_: pytest.fail("it began first"))
+    monkeypatch.setattr("armcal_online.mission.mission.import_module", failing)
+    monkeypatch.setattr("armcal_online.mission.mission.run_mission", lambda *_: pytest.fail("it began first"))
     done = CliRunner().invoke(cli, ["mission", str(CONFIG), "--out", str(tmp_path / "out")])
     assert done.exit_code in (1, 2) and isinstance(done.exception, SystemExit)
     assert "Traceback" not in done.output

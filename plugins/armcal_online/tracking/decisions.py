@@ -1,6 +1,6 @@
 """The kinds of decisions: what each means, what an operator does about it, and what would confirm it.
 
-A new kind is one entry of ``KINDS`` and its section in docs/decisions.md.
+A new kind is one entry of ``KINDS`` and its section in docs/decisions.md, which says what happened, in general.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ class DecisionKind:
     trouble improve the level) and ``{good}`` (where to roll back to).
     """
 
-    means: str  # what happened, in general; for the page of all decisions
     do: str  # what to do now
     confirm: str  # what would confirm it, or show that it is wrong
     level: Level | None  # of health that it means; None: it says nothing about the arm
@@ -36,7 +35,6 @@ class DecisionKind:
 
 KINDS: Mapping[str, DecisionKind] = {
     "joint_slipped": DecisionKind(
-        means="The zero of one joint moved at once, as when a servo horn slips a tooth. The new offset is in use.",
         do="Go on with coarse work. Take {calm} records at different poses before precise work.",
         confirm="Take 3 records that differ in {subject} alone: they fit if it slipped. If it slips again, the joint "
         "is loose: keep its load low. If they do not fit, roll back to {good}.",
@@ -44,8 +42,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "joint_replaced": DecisionKind(
-        means="One joint behaves like another servo: its offset, gain, backlash and compliance changed together. All "
-        "of them are estimated anew.",
         do="Stop precise work that needs {subject}. Take {calm} records with it at angles over its whole range, "
         "approached from both sides.",
         confirm="Was its servo replaced or restarted? If not, take the same pose three times: readings that differ "
@@ -54,8 +50,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "joint_stepped": DecisionKind(
-        means="One of several joints stepped. In the poses since, their steps move the tip alike, so that no record "
-        "says which joint it was.",
         do="Go on with coarse work near the newest poses only. Take 3 records with {candidates} at clearly different "
         "angles, one joint at a time.",
         confirm="The decision joint_named follows as soon as a pose distinguishes them.",
@@ -63,7 +57,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "joint_named": DecisionKind(
-        means="The records now determine which of several joints stepped. The others have their offsets of before.",
         do="Go on with coarse work. Take {calm} records at different poses before precise work.",
         confirm="Take 3 records that differ in {subject} alone: they fit if it was this joint. If they do not, roll "
         "back to {good}.",
@@ -71,8 +64,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "sensor_moved": DecisionKind(
-        means="The frame of an instrument moved against the arm's base, as when a camera is bumped. Its place is "
-        "estimated anew; the arm itself did not change.",
         do="Go on, in the new frame of {subject}. Measure targets again before the arm goes to them: positions from "
         "before are in the old frame. Take {calm} records at different poses before precise work.",
         confirm="Look at something fixed to the arm's base with {subject}: it appears moved if {subject} moved. If it "
@@ -81,9 +72,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "payload_changed": DecisionKind(
-        means="What hangs on the tool became heavier or lighter, and the records do not state it: the springs of all "
-        "joints give way as under a load. Its mass and, as far as records determine it, its centre are estimated; the "
-        "arm itself did not change.",
         do="Go on. State the payload in the records, or let the tool set it down. Take {calm} records at different "
         "poses before precise work.",
         confirm="Is something in the gripper, or was it lost? Set it down and take 3 records: another decision of this "
@@ -92,8 +80,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "gravity_tilted": DecisionKind(
-        means="Gravity pulls the arm from another direction than the records or the configuration state, as when the "
-        "base tilts together with its instrument, or an inclinometer errs. The direction is estimated anew.",
         do="Go on with coarse work. Check the inclinometer, or state gravity as it is now. Take {calm} records at "
         "different poses before precise work.",
         confirm="Compare the stated direction of gravity with another sensor on the base: they differ by the size of "
@@ -102,8 +88,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "link_bent": DecisionKind(
-        means="The geometry of one link jumped, more than the zero of the joint at either end explains: it is bent, or "
-        "its screws gave. All free lengths and angles of the link are estimated anew.",
         do="Stop work that loads {subject}. Take 20 records at poses that move every joint.",
         confirm="The new records fit if it is bent. If the same decision comes again, it goes on giving way: keep its "
         "load low. If they do not fit, roll back to {good}.",
@@ -111,8 +95,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "joint_creeping": DecisionKind(
-        means="The zero of one joint moves on and on, faster than process_noise states, as a screw works loose or a "
-        "gear wears. The motion is taken into the estimate, which follows it from now on.",
         do="Go on with coarse work; keep the load of {subject} low. State a process_noise for its zero. Take {calm} "
         "records at different poses before precise work.",
         confirm="The decision states how far the zero moves in a day. If it does not, another decision of this kind "
@@ -121,8 +103,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "sensor_drifting": DecisionKind(
-        means="What an instrument reads is off by more every day, alike at all poses: its mount creeps, or it warms "
-        "up. The bias is taken into the estimate, which follows it from now on; the arm itself did not change.",
         do="Go on, in the frame of {subject}. Measure targets again before the arm goes to them. Check the mount and "
         "the warm-up of {subject}.",
         confirm="Look at something fixed to the arm's base with {subject}, today and tomorrow: it appears to move. If "
@@ -131,8 +111,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "one_of_several": DecisionKind(
-        means="Something changed at once, and the records since fit several causes of different kinds about equally. "
-        "None is named; all of them are open.",
         do="Stop precise work. Take 10 records at poses that move every joint, near and far, so that loads and lengths "
         "act differently. It is one of {candidates}.",
         confirm="A decision that names the one follows as soon as the records distinguish them.",
@@ -140,8 +118,6 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "drift": DecisionKind(
-        means="Records miss by more than stated, although no single one does by much: parameters drift faster than "
-        "process_noise states, or the instrument is worse than stated. All standard deviations were increased.",
         do="Go on with coarse work. Take {calm} records at the poses of the work before precise work.",
         confirm="If it comes again within a day, it is no chance: state a larger process_noise, or a larger noise of "
         "the instrument.",
@@ -149,23 +125,18 @@ KINDS: Mapping[str, DecisionKind] = {
         explains=True,
     ),
     "general_change": DecisionKind(
-        means="Something changed that no single joint or instrument explains. All standard deviations were increased, "
-        "and everything is estimated again.",
         do="Stop precise work. Take 20 records at poses that move every joint.",
         confirm="The new records fit and the level improves if the change is one of the parameters. If it does not "
         "after 20 records, roll back to {good}.",
         level="suspect",
     ),
     "unexplained": DecisionKind(
-        means="Several of the last records do not fit, and no change explains them yet. Nothing was changed.",
         do="Stop precise work. Take 10 records at poses that move every joint.",
         confirm="If the new records fit, the others were wrong measurements: look at dust, glare and the target. If "
         "they do not, a decision that names the change follows.",
         level="suspect",
     ),
     "model_no_longer_fits": DecisionKind(
-        means="No change of the parameters makes the records fit. The calibration must not be used: commands that "
-        "would use it refuse it.",
         do="Stop the arm's work. Check the measurements first (target, lens, clock, joint readings). If they were "
         "wrong, roll back to {good}. If they are right, take 40 records all over the workspace, and calibrate "
         "again from the records since.",
@@ -174,14 +145,11 @@ KINDS: Mapping[str, DecisionKind] = {
         level="lost",
     ),
     "clock": DecisionKind(
-        means="The clock of the records jumped. Estimate and level are not touched by it.",
         do="Go on. Set the clock of what sends the records.",
         confirm="The next records come without this note.",
         level=None,
     ),
     "rollback": DecisionKind(
-        means="Somebody set the estimate back to what it was after an earlier record. Later records are kept in the "
-        "journal, and have no effect. The level is that of then.",
         do="Take {calm} records at different poses before precise work.",
         confirm="The new records fit if the arm is as it was then.",
         level=None,
