@@ -236,7 +236,6 @@ class RowParser:
 
 
 def faulty(place: Place, sentence: str) -> Incoming:
-    """A record that could not be read."""
     return Incoming(
         str(place.row), {}, {}, place.arrived, place.source_key, place.row, _short(_clean(sentence), MAX_FAULT)
     )

@@ -100,7 +100,7 @@ def test_payloads_below_zero_and_times_in_milliseconds_are_refused_and_kelvin_is
 def test_rows_are_named_as_rows_unless_they_are_lines() -> None:
     dataset = records(arm_approach_q1=[0.5] * 8)
     assert str(layout().where(dataset, 0, "arm.approach.q1")) == "poses.csv:2, approach1"
-    found = refusal(lambda: checks.refuse_approaches(dataset, layout(by_line=False)))
+    found = refusal(lambda: checks.refuse_impossible(dataset, layout(by_line=False)))
     assert found.startswith("poses.csv, row 2, approach1: found the approach 0.5, expected -1, 0 or 1. Write the sign")
 
 

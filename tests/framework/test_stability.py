@@ -143,7 +143,7 @@ def test_the_search_ends_only_where_the_potential_has_a_minimum() -> None:
             slopes = -np.einsum("ji,jn,jk->nik", mixing, weight[:, None] * np.cos(angles), mixing)
             return -mixing.T @ (weight[:, None] * np.sin(angles)), slopes
 
-        if settle(evaluate, state).sound[0]:
+        if settle(evaluate, state)[0]:
             held += 1
             following, slopes = evaluate(np.arange(1))
             assert np.abs(following - state).max() < 1e-9

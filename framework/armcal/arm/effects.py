@@ -155,7 +155,6 @@ class JointEffect:
 
 
 def reshapes(effect: JointEffect) -> bool:
-    """Whether an effect changes the arm's shape."""
     return type(effect).shaped is not JointEffect.shaped
 
 

@@ -66,31 +66,6 @@ def lowest(slopes: Array) -> Array:
     return low
 
 
-def refusal(which: str, springs: Sequence[str], state: Array, slope: Array, far: bool) -> NotConvergedError:
-    """What to say of a record without an equilibrium that springs hold.
-
-    Args:
-        which: the record, and its pose.
-        springs: of each number of the state, what gives.
-        state: where the search ended (n_d).
-        slope: S there (n_d x n_d).
-        far: whether nothing came to rest within what springs may give; else the springs do not hold what did.
-    """
-    if np.isnan(slope).any():
-        names = [name for name, row in zip(springs, slope, strict=True) if np.isnan(row).any()]
-        text = f"is no number (NaN): the law of the spring of {' or '.join(names)} gives none under its load."
-        return NotConvergedError(f"the elastic equilibrium of {which} {text}", hint="Correct that law.")
-    if far:
-        name = springs[int(np.argmax(np.abs(state)))]
-        text = f"did not settle: {name} would give by more than {MOST_DEFLECTION:g} rad (or m) under its load."
-    else:
-        values, vectors = np.linalg.eig(slope)
-        name = springs[int(np.argmax(np.abs(vectors[:, np.argmax(values.real)])))]
-        text = f"is not stable: the load on {name} grows faster than its spring answers, so that the arm would fall."
-    hint = f"Bound the compliance of {name}, check masses, units and gravity, or take another pose or a smaller load."
-    return NotConvergedError(f"the elastic equilibrium of {which} {text}", hint=hint)
-
-
 def settle(evaluate: Evaluate, state: Array) -> Mask:
     """Bring states (n_d x N) to equilibria that the springs hold, in place, and say of which this came true (N).
 
@@ -262,7 +237,23 @@ class Evaluator:
         following, slopes = self._slopes(values, own, at)(np.arange(1))
         far = not (np.abs(following - at).max() < NEAR_REST_RAD and np.abs(at).max() <= MOST_DEFLECTION)
         state[:] = before
-        raise refusal(self._elastic.described(bad, own[:, 0]), self._elastic.springs, at[:, 0], slopes[0], far)
+        which, springs, slope = self._elastic.described(bad, own[:, 0]), self._elastic.springs, slopes[0]
+        hint = "Correct that law."
+        if np.isnan(slope).any():
+            names = [name for name, row in zip(springs, slope, strict=True) if np.isnan(row).any()]
+            text = f"is no number (NaN): the law of the spring of {' or '.join(names)} gives none under its load."
+        else:
+            if far:
+                name = springs[int(np.argmax(np.abs(at[:, 0])))]
+                text = f"did not settle: {name} would give by more than {MOST_DEFLECTION:g} rad (or m) under its load."
+            else:
+                eigenvalues, vectors = np.linalg.eig(slope)
+                name = springs[int(np.argmax(np.abs(vectors[:, np.argmax(eigenvalues.real)])))]
+                text = f"is not stable: the load on {name} grows faster than its spring answers: the arm would fall."
+            hint = (
+                f"Bound the compliance of {name}, check masses, units and gravity, or take another pose or less load."
+            )
+        raise NotConvergedError(f"the elastic equilibrium of {which} {text}", hint=hint)
 
     def _slopes(self, values: Array, record: Array, state: Array) -> Evaluate:
         size = len(state)

@@ -61,7 +61,6 @@ class Joint:
 
     @property
     def is_revolute(self) -> bool:
-        """Whether it turns."""
         return any(self.angular)
 
     @property

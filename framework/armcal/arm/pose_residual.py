@@ -47,7 +47,6 @@ class Postures:
     surroundings: Mapping[str, Array] = field(default_factory=dict)
 
     def subset(self, chosen: Any) -> Postures:
-        """Some of them."""
         around = {name: column[chosen] for name, column in self.surroundings.items()}
         return Postures(self.commands[:, chosen], self.approaches[:, chosen], around)
 
@@ -141,6 +140,5 @@ def reached(commands: Array) -> tuple[tuple[float, float], ...]:
 
 
 def corrected(base_T_tool: Transform, correction: Expression) -> Transform:
-    """A tool with corrections of the tool (6 x 1)."""
     turned = ca.mtimes(base_T_tool.rotation, small_rotation(correction[3:6]))
     return Transform(turned, base_T_tool.translation + correction[:3])

@@ -44,7 +44,7 @@ class InterpretedFunction:
 
     def __init__(self, function: ca.Function, shared: int = 0) -> None:
         self.function, self._shared = function, shared
-        self._memory = threading.local()  # each thread's own, by the number of records at once
+        self._memory = threading.local()
         self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]
 
     def __call__(self, *inputs: Array) -> list[Array]:
@@ -64,7 +64,7 @@ class InterpretedFunction:
         return outputs
 
     def _evaluated(self, inputs: Sequence[Array], records: int) -> list[Array]:
-        own = self._memory.__dict__
+        own: Any = self._memory.__dict__  # each thread's, by the number of records at once
         bound: BoundFunction | None = own.get(records)
         if bound is None:
             bound = own[records] = BoundFunction(self.function, records, self._shared)

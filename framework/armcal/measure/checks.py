@@ -196,9 +196,8 @@ def check_records(dataset: Dataset, layout: Layout) -> Dataset:
         DataError: the dataset is refused, or no record is left.
     """
     dataset = set_aside_without_noise(set_aside_not_finite(dataset, layout), layout)
-    refuse_approaches(dataset, layout)
+    refuse_impossible(dataset, layout)
     refuse_joint_units(dataset, layout)
-    refuse_impossible_surroundings(dataset, layout)
     refuse_conflicting_ids(dataset, layout)
     dataset = set_aside_backward_time(dataset, layout)
     dataset = set_aside_duplicates(set_aside_frozen(set_aside_zeros(dataset, layout), layout), layout)
@@ -361,44 +360,27 @@ def set_aside_without_noise(dataset: Dataset, layout: Layout) -> Dataset:
     return set_aside(dataset, layout, faulty, "their noise is not above zero", "State the standard deviation.")
 
 
-def refuse_approaches(dataset: Dataset, layout: Layout) -> None:
-    """An approach is the sign of a motion.
+def refuse_impossible(dataset: Dataset, layout: Layout) -> None:
+    """Approaches, payloads and times that cannot be.
 
     Raises:
-        DataError: it is not -1, 0 or 1.
+        DataError: an approach that is no sign, a payload below zero, or a time after the year 5000: milliseconds
+            called seconds.
     """
-    for channel in layout.approach:
-        values = dataset.column(channel)
-        wrong = np.flatnonzero((values != 0) & (np.abs(values) != 1))
-        if wrong.size:
-            first = int(wrong[0])
-            raise DataError(
-                f"found the approach {values[first]:g}, expected -1, 0 or 1.",
-                where=layout.where(dataset, first, channel),
-                hint="Write the sign of the joint's last motion before the pose, 0 if it is not known.",
-            )
-
-
-def refuse_impossible_surroundings(dataset: Dataset, layout: Layout) -> None:
-    """Payloads and times that cannot be.
-
-    Raises:
-        DataError: a payload below zero, or a time after the year 5000: milliseconds called seconds.
-    """
-    if dataset.has("payload") and (below := np.flatnonzero(dataset.column("payload") < 0)).size:
-        first = int(below[0])
-        raise DataError(
-            f"found a payload of {layout.shown('payload', dataset.column('payload')[first])}, which is below zero.",
-            where=layout.where(dataset, first, "payload"),
-            hint="Give the mass that hangs on the tool.",
-        )
-    if dataset.has("time") and (late := np.flatnonzero(dataset.column("time") > _LATEST_S)).size:
-        first = int(late[0])
-        raise DataError(
-            f"found the time {layout.shown('time', dataset.column('time')[first])}, after the year 5000.",
-            where=layout.where(dataset, first, "time"),
-            hint="If these are milliseconds, end the column's name in _ms (time_ms), microseconds in _us.",
-        )
+    sign = "Write the sign of the joint's last motion before the pose, 0 if it is not known."
+    clock = "If these are milliseconds, end the column's name in _ms (time_ms), microseconds in _us."
+    for channel, wrong, text, hint in (
+        *(
+            (name, lambda x: ~np.isin(x, (-1, 0, 1)), "the approach {}, expected -1, 0 or 1", sign)
+            for name in layout.approach
+        ),
+        ("payload", lambda x: x < 0, "a payload of {}, which is below zero", "Give the mass that hangs on the tool."),
+        ("time", lambda x: x > _LATEST_S, "the time {}, after the year 5000", clock),
+    ):
+        if dataset.has(channel) and (places := np.flatnonzero(wrong(dataset.column(channel)))).size:
+            first = int(places[0])
+            found = text.format(layout.shown(channel, dataset.column(channel)[first]))
+            raise DataError(f"found {found}.", where=layout.where(dataset, first, channel), hint=hint)
 
 
 def warn_kelvin(dataset: Dataset, layout: Layout) -> Dataset:

@@ -306,7 +306,6 @@ def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
 
 
 def delimiter_of(text: str) -> str:
-    """The likeliest between the cells of a line."""
     return next((delimiter for delimiter in _LIKELY if delimiter in text), BLANKS)
 
 

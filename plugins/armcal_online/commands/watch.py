@@ -8,7 +8,6 @@ import hashlib
 import json
 import math
 import re
-import signal
 import sys
 from collections.abc import Mapping
 from functools import lru_cache
@@ -49,22 +48,11 @@ def watch(folder: Path, port: int, once: bool) -> None:
     if once:
         for line in first_screen(present(folder)):
             say(line)
-    else:
-        _serve(WatchServer(folder, port))
-
-
-def _serve(server: "WatchServer") -> None:
-    def stop(*_: object) -> None:
-        raise SystemExit(0)
-
-    earlier = signal.signal(signal.SIGTERM, stop)
-    with server:
-        say(f"Watching {server.folder}: {server.address}")
+        return
+    with WatchServer(folder, port) as server:
+        say(f"Watching {folder}: {server.address}")
         sys.stdout.flush()
-        try:
-            server.serve_forever()
-        finally:
-            signal.signal(signal.SIGTERM, earlier)
+        server.serve_forever()
 
 
 def first_screen(now: Mapping[str, Any]) -> list[str]:

@@ -60,7 +60,6 @@ class Progress:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Progress:
-        """What ``asdict`` made."""
         positions, recent = dict(content["positions"]), dict(content["recent"])
         return cls(int(content["records"]), bool(content["paused"]), positions, recent)
 

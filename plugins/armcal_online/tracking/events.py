@@ -175,7 +175,6 @@ def _named(arrival: Arrival | None) -> dict[str, Any] | None:
 
 
 def estimated(state: State, parameters: Mapping[str, list[float]]) -> dict[str, Any]:
-    """What is believed: value and standard deviation by entry (SI)."""
     return _event("estimate", state, parameters=dict(parameters))
 
 

@@ -226,14 +226,9 @@ class Recalibrator:
 
         Raises:
             DataError: it is not one of this calibration with these settings.
+            KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
         """
-        try:
-            state = State.from_dict(snapshot)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as fault:
-            raise DataError(
-                f"found no state of a recalibration in the journal ({type(fault).__name__}: {fault}).",
-                hint="Read it with the version of armcal that wrote it, or begin a new --out from its calibration.",
-            ) from fault
+        state = State.from_dict(snapshot)
         count, expected = len(state.belief.gaussian.mean), self.setup.observer.size
         if count != expected:
             raise DataError(
