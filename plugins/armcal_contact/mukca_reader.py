@@ -24,7 +24,7 @@ from armcal.measure.checks import read_as
 from armcal.measure.instrument import named_arm
 from armcal.measure.measurement import GroupedMeasurement, noise_channels
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal.measure.tables import CellFault, open_table, read_cell
+from armcal.measure.tables import open_table, read_cell
 
 _FULL_TURN = 2 * math.pi
 _NOISE = "noise"
@@ -181,11 +181,11 @@ def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> t
 
 
 def _number(path: Path, line: int, cell: str, name: str) -> float:
-    number = read_cell(cell)
-    if isinstance(number, CellFault):
+    try:
+        return read_cell(cell)
+    except DataError as fault:
         header = " These files have no header." if line == 1 else ""
-        refuse(path, number.text, number.hint + header, line, name)
-    return number
+        refuse(path, fault.message, fault.hint + header, line, name)
 
 
 def _weighed(dataset: Dataset, request: ReadRequest) -> Dataset:

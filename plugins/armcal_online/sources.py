@@ -32,7 +32,7 @@ from armcal.measure.tables import (
     header_of,
     is_missing,
     match_columns,
-    number_of,
+    read_cell,
     refuse_missing,
     renamed,
 )
@@ -250,7 +250,7 @@ def _number(value: Any, name: str) -> float:
     if value is None:
         return math.nan
     if isinstance(value, str):
-        return number_of("", None, value, name)
+        return read_cell(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
         refuse("", f"found {_short(json.dumps(value), 40)}, expected a number.", "", column=name)
     try:

@@ -16,13 +16,13 @@ from armcal.measure.checks import Layout, read_as, require_records, set_aside, w
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal.measure.tables import (
     DECIMAL_COMMA,
-    CellFault,
     Column,
     Header,
     Plan,
     Row,
     Table,
     header_of,
+    is_number,
     match_columns,
     open_table,
     read_cell,
@@ -130,19 +130,20 @@ def _load(table: Table, header: Header, plan: Plan, has_commas: bool) -> Dataset
 
 def _number(cell: str, line: int, column: Column, header: Header, has_commas: bool) -> float:
     """One cell; NaN if its value is missing."""
-    number = read_cell(cell)
-    if has_commas and DECIMAL_COMMA.fullmatch(cell):
-        number = read_cell(with_point(cell))
-    elif has_commas and "." in cell and not isinstance(number, CellFault):
-        number = CellFault(f"found {cell!r}, expected a decimal comma.", 'Write 12,5, or leave decimal: "," out.')
-    if isinstance(number, CellFault):
+    try:
+        if not has_commas:
+            return read_cell(cell)
+        if "." in cell and is_number(cell):
+            hint = 'Write 12,5, or leave decimal: "," out.'
+            raise DataError(f"found {cell!r}, expected a decimal comma.", hint=hint)
+        return read_cell(with_point(cell) if DECIMAL_COMMA.fullmatch(cell) else cell)
+    except DataError as fault:
         where = Location(header.source, line=line, field=column.name)
         if cell.strip() == column.name:
-            raise DataError("found the header again.", where=where, hint="Remove this line.")
+            raise DataError("found the header again.", where=where, hint="Remove this line.") from fault
         is_comma = not (has_commas or header.layout_hint) and DECIMAL_COMMA.fullmatch(cell)
         other = ' Or set decimal: "," in the data section, if all numbers of the file have one.' if is_comma else ""
-        raise DataError(number.text, where=where, hint=number.hint + other)
-    return number
+        raise DataError(fault.message, where=where, hint=fault.hint + other) from fault
 
 
 QUATERNION = ("qw", "qx", "qy", "qz")

@@ -67,7 +67,7 @@ class BatchFunction:
             self._asked += count
             if self._asked > _WORTH_COMPILING and self._compile_later is not None:
                 later, self._compile_later = self._compile_later, None
-                quietly(lambda: later())
+                later()
             return self.interpreted(*inputs)
         whole = count - count % c_source.LANES
         if not whole and count:
@@ -132,16 +132,8 @@ def _library(
 
     library = compiler.load_cached(key, entries)
     if library is None and choice == "compiled":
-        library = quietly(partial(compiler.compile_now, key, source, entries))
+        library = compiler.compile_now(key, source, entries)
     return library, partial(compiler.compile_in_background, key, source)
-
-
-def quietly(build: Callable[[], ctypes.CDLL | None]) -> ctypes.CDLL | None:
-    """What was built, or None: an expression without a C form is no fault, the interpreter serves."""
-    try:
-        return build()
-    except c_source.UnsupportedExpressionError:
-        return None
 
 
 def _driver(function: ca.Function) -> str:

@@ -27,6 +27,7 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.functions import library_build
+from armcal.functions.c_source import UnsupportedExpressionError
 
 FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared", "-w")
 ENTRY_POINTS = ("armcal_residuals", "armcal_linearise")
@@ -132,7 +133,7 @@ def _prepare(key: str, source: Callable[[], str]) -> list[str] | None:
         build = Path(tempfile.mkdtemp(prefix=_BUILD, dir=directory))
         (build / "kernel.c").write_text(text, encoding="utf-8")
         (build / "job.json").write_text(json.dumps(job), encoding="utf-8")
-    except OSError:
+    except (OSError, UnsupportedExpressionError):  # an expression without a C form is no fault: the interpreter serves
         return None
     # -I and -S: nothing but Python's own library is found, whatever lies in the working directory.
     return [sys.executable, "-I", "-S", library_build.__file__, str(build)]

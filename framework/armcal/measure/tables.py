@@ -43,14 +43,6 @@ _UNIT_WORDS = frozenset({*UNITS, "°", "degree", "degrees", "radians", "meters",
 _NUMBER_AND_UNIT = re.compile(r"\s*[+-]?[0-9]*[.,]?[0-9]+\s*[^\W\d][\w/^]*\s*")
 
 
-@dataclass(frozen=True)
-class CellFault:
-    """A cell that holds no number: what was found, and how to mend it; sentences."""
-
-    text: str
-    hint: str
-
-
 def is_number(text: str) -> bool:
     """Whether Python reads a number, in ASCII: it would read 1_000, and digits of other scripts, too."""
     if not text.isascii() or "_" in text:
@@ -77,22 +69,27 @@ def is_missing(text: str) -> bool:
     return text.strip().lower() in MISSING
 
 
-def read_cell(cell: str) -> float | CellFault:
-    """The number in a cell; NaN if its value is missing."""
+def read_cell(cell: str, where: Location | None = None) -> float:
+    """The number in a cell; NaN if its value is missing.
+
+    Raises:
+        DataError: it holds none.
+    """
     if is_number(cell):
         return float(cell)
     if is_missing(cell):
         return float("nan")
     shown = repr(cell if len(cell) <= 40 else f"{cell[:40]}...")
     if DECIMAL_COMMA.fullmatch(cell):
-        return CellFault(f"found {shown}, a decimal comma.", f"Write decimal points: {with_point(cell)}.")
+        hint = f"Write decimal points: {with_point(cell)}."
+        raise DataError(f"found {shown}, a decimal comma.", where=where, hint=hint)
     if cell.strip(" []()").lower() in _UNIT_WORDS:
-        mend = "Remove it; each column's name ends in its unit, as in q1_deg."
-        return CellFault(f"found {shown}: this looks like a row of units.", mend)
+        hint = "Remove it; each column's name ends in its unit, as in q1_deg."
+        raise DataError(f"found {shown}: this looks like a row of units.", where=where, hint=hint)
     hint = "Correct it, or leave the cell empty to set the record aside."
     if _NUMBER_AND_UNIT.fullmatch(cell):
         hint = "Write the number alone; its unit belongs in the column's name."
-    return CellFault(f"found {shown}, expected a number.", hint)
+    raise DataError(f"found {shown}, expected a number.", where=where, hint=hint)
 
 
 def with_point(text: str) -> str:
@@ -147,14 +144,18 @@ class Table:
         Args:
             numbers, texts: which.
             has_header: whether the first row is one; else it is read too.
-            number: reads a cell that is no plain number; by default ``number_of``.
+            number: reads a cell that is no plain number; by default ``read_cell``.
             plain: whether a cell that Python reads as a number is that number.
 
         Raises:
             DataError: with file, line and column.
         """
         rows, width = self.rest if has_header else chain([self.first], self.rest), len(self.first[1])
-        number = number or partial(number_of, self.path)
+
+        def plainly(line: int, cell: str, name: str) -> float:
+            return read_cell(cell, Location(str(self.path), line=line, field=name))
+
+        number = number or plainly
         lines, blocks, words = list[int](), [list[Array]() for _ in numbers], [list[str]() for _ in texts]
         while block := list(islice(rows, _ROWS_AT_ONCE)):
             for line, cells in block:
@@ -307,18 +308,6 @@ def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
 
 def delimiter_of(text: str) -> str:
     return next((delimiter for delimiter in _LIKELY if delimiter in text), BLANKS)
-
-
-def number_of(path: Path | str, line: int | None, cell: str, name: str) -> float:
-    """A cell's number; NaN where it is empty.
-
-    Raises:
-        DataError: it is none.
-    """
-    number = read_cell(cell)
-    if isinstance(number, CellFault):
-        refuse(path, number.text, number.hint, line, name)
-    return number
 
 
 MAX_ID_LIST_BYTES = 1 << 26

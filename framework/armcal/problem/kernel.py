@@ -28,7 +28,7 @@ from typing_extensions import override
 from armcal.arm.evaluator import MOST_DEFLECTION, MOST_PASSES, NEAR_REST_RAD, REST_RAD, Evaluator, by_passes
 from armcal.base.arrays import Array, Indices
 from armcal.functions import c_source, compiler
-from armcal.functions.batch_function import EvaluatorChoice, quietly
+from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.c_source import LANES
 from armcal.functions.interpreted import InterpretedFunction
 from armcal.problem.factor import Factor
@@ -291,9 +291,9 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
     library = compiler.load_cached(key)
     if library is None:
         if choice == "auto" and records < WORTH_COMPILING_RECORDS:
-            quietly(lambda: compiler.compile_in_background(key, source))
+            compiler.compile_in_background(key, source)
             return Kernel(factor, interpreter)
-        library = quietly(lambda: compiler.compile_now(key, source))
+        library = compiler.compile_now(key, source)
     if library is not None and agree(own, interpreter, compiled := Compiled(library)):
         return Kernel(factor, compiled, key)
     return Kernel(factor, interpreter)
