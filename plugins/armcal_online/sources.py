@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 from zlib import crc32
 
 from armcal.base.units import from_unit
@@ -299,13 +299,16 @@ class Lines(Source):
 
     def __init__(self, rows: RowParser, source: Path | int) -> None:
         self._rows, self._positions = rows, dict[str, int]()
-        self._name, self._descriptor, self._file = "standard input", source, None
+        self._name = "standard input"
+        self._file: BinaryIO | None = None
         self._cutter, self._lines = LineCutter(), deque[bytes | None]()
         self._table: tuple[LineTable, Plan] | None = None
         self._header = b""
         self._key, self._row, self._through = "", 0, 0  # of the present text: which it is, its last row, the last taken
         self._is_at_end = False
-        if isinstance(source, Path):
+        if isinstance(source, int):
+            self._descriptor = source
+        else:
             self._name, self._file = str(source), input_file(source, sys.maxsize, "a file of records", InputError, 0)
             self._descriptor = self._file.fileno()
             head = os.pread(self._descriptor, MAX_LINE_BYTES, 0)

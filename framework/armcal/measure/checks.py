@@ -7,7 +7,7 @@ records set aside or a warning added, or raises `DataError`. ``check_dataset`` r
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -369,18 +369,17 @@ def refuse_impossible(dataset: Dataset, layout: Layout) -> None:
     """
     sign = "Write the sign of the joint's last motion before the pose, 0 if it is not known."
     clock = "If these are milliseconds, end the column's name in _ms (time_ms), microseconds in _us."
-    for channel, wrong, text, hint in (
-        *(
-            (name, lambda x: ~np.isin(x, (-1, 0, 1)), "the approach {}, expected -1, 0 or 1", sign)
-            for name in layout.approach
-        ),
+    kinds: list[tuple[str, Callable[[Array], Mask], str, str]] = [
         ("payload", lambda x: x < 0, "a payload of {}, which is below zero", "Give the mass that hangs on the tool."),
         ("time", lambda x: x > _LATEST_S, "the time {}, after the year 5000", clock),
-    ):
+    ]
+    for name in layout.approach:
+        kinds.append((name, lambda x: ~np.isin(x, (-1, 0, 1)), "the approach {}, expected -1, 0 or 1", sign))
+    for channel, wrong, text, hint in kinds:
         if dataset.has(channel) and (places := np.flatnonzero(wrong(dataset.column(channel)))).size:
             first = int(places[0])
-            found = text.format(layout.shown(channel, dataset.column(channel)[first]))
-            raise DataError(f"found {found}.", where=layout.where(dataset, first, channel), hint=hint)
+            value = text.format(layout.shown(channel, dataset.column(channel)[first]))
+            raise DataError(f"found {value}.", where=layout.where(dataset, first, channel), hint=hint)
 
 
 def warn_kelvin(dataset: Dataset, layout: Layout) -> Dataset:
