@@ -61,6 +61,7 @@ class Joint:
 
     @property
     def is_revolute(self) -> bool:
+        """Whether it turns."""
         return any(self.angular)
 
     @property

@@ -47,6 +47,7 @@ class Postures:
     surroundings: Mapping[str, Array] = field(default_factory=dict)
 
     def subset(self, chosen: Any) -> Postures:
+        """Some of them."""
         around = {name: column[chosen] for name, column in self.surroundings.items()}
         return Postures(self.commands[:, chosen], self.approaches[:, chosen], around)
 

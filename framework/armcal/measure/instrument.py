@@ -28,15 +28,19 @@ class Contact:
     mean_weight: float = 1.0
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
+        """None of its own."""
         return ()
 
     def channels(self) -> tuple[Channel, ...]:
+        """None: the joints are all that is read."""
         return ()
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Expression]) -> dict[str, Expression]:
+        """None."""
         return {}
 
     def ties(self, groups: Sequence[str]) -> tuple[Tie, ...]:
+        """Nothing is known between groups."""
         return ()
 
 
