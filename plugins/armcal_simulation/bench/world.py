@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
-from armcal.arm.assembly import ArmInputs, only_arm, scoped
+from armcal.arm.assembly import ArmInputs, holding_function, only_arm, scoped
 from armcal.arm.evaluator import ElasticPass, Evaluator
-from armcal.arm.loading import holding_function
 from armcal.arm.statics import STATICS, tilted
 from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
