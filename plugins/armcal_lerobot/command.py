@@ -102,7 +102,7 @@ def zeros(
     What changes is shown first, and a question asked. The records must have been taken with this very file. Its old
     content is kept beside it.
     """
-    from armcal.calibration.joint_zeros import zeros_of
+    from armcal.calibration.calibration import zeros_of
 
     from armcal_lerobot.motor_files import read_motors, require_not_written, rezeroed, wiring_of
 

@@ -22,8 +22,7 @@ from armcal import Finding
 from armcal.arm.joints import joint_limits
 from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
-from armcal.calibration.calibration import Calibration
-from armcal.calibration.joint_zeros import Zero
+from armcal.calibration.calibration import Calibration, Zero
 from armcal.calibration.tool_expression import arm_expression
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 from armcal.base.config_text import as_line
-from armcal.calibration.measured_point import Point
+from armcal.calibration.tool_expression import Point
 from armcal.cli.common import Console, accept, point, speaking, within
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.lines import StandardOutput

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
 from armcal.calibration.compensation import Compensator, Options
-from armcal.calibration.measured_point import Point
-from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
+from armcal.calibration.intervals import PAYLOAD, RecordedRange
+from armcal.calibration.tool_expression import Point
 from armcal.config.yaml_source import MAX_BYTES
 from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, InputError, Location
 from armcal.functions.batch_function import EvaluatorChoice

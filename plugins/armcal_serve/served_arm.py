@@ -12,8 +12,8 @@ from armcal.base.poses import PoseSettings
 from armcal.base.quaternions import rotation_matrix
 from armcal.base.units import from_unit, split_suffix, to_unit
 from armcal.calibration.compensation import Compensator, Targets
-from armcal.calibration.measured_point import Point
-from armcal.calibration.recorded_range import PAYLOAD, RecordedRange
+from armcal.calibration.intervals import PAYLOAD, RecordedRange
+from armcal.calibration.tool_expression import Point
 from armcal.errors import DataError, Location
 
 from armcal_serve.protocol import ArmRequest, CompensateRequest, TargetRequest

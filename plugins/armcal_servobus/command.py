@@ -299,7 +299,7 @@ def home(
 
 def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping[str, ServoJoint]) -> dict[str, float]:
     """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
-    from armcal.calibration.joint_zeros import zeros_of
+    from armcal.calibration.calibration import zeros_of
 
     zeros, reasons = zeros_of(calibration, arm, console.registry())
     for name, reason in reasons.items():

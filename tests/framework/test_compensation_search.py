@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal.calibration.inverse import NEAREST, PREFERRED, QUICK, Goal, Manner, Near, Search, slopes, step_function
+from armcal.calibration.inverse import NEAREST, PREFERRED, QUICK, Goal, Manner, Solver, slopes, step_function
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
 from small_arms import compensator, drawn
@@ -15,22 +15,25 @@ from small_arms import compensator, drawn
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
 LENGTH = 0.1
-NEAR = Near(metres=1e-10, radians=1e-9, rest=1e-11)
+NEAR = (1e-10, 1e-9)  # m, rad
+REST = 1e-11
 
 
 class Pair:
     """Both searches of one arm and kind of target."""
 
-    def __init__(self, name: str, turns: bool, limits: np.ndarray | None = None) -> None:
-        self.found, self.turns = compensator(name), turns
+    def __init__(
+        self, name: str, turns: bool, limits: np.ndarray | None = None, near: tuple[float, float] = NEAR
+    ) -> None:
+        self.near, self.found, self.turns = near, compensator(name), turns
         self.limits = self.found.limits if limits is None else limits
         self.compiled, self.interpreted = self.search("compiled"), self.search("interpreted")
         assert self.compiled.compiled
         assert not self.interpreted.compiled
 
-    def search(self, choice: EvaluatorChoice) -> Search:
+    def search(self, choice: EvaluatorChoice) -> Solver:
         expression = self.found.expression
-        return Search(expression, self.limits, "pose" if self.turns else "position", LENGTH, choice)
+        return Solver(expression, self.limits, "pose" if self.turns else "position", LENGTH, self.near, choice)
 
     def goal(self, count: int, stretch: float = 1.0) -> Goal:
         """Targets of random commands (farther out where they are stretched), from other random commands."""
@@ -46,7 +49,7 @@ class Pair:
 
     def alike(self, goal: Goal, manner: Manner) -> float:
         """The share of targets that are reached; everything else must agree."""
-        one, two = self.compiled(goal, manner, NEAR), self.interpreted(goal, manner, NEAR)
+        one, two = self.compiled.exactly(goal, manner), self.interpreted.exactly(goal, manner)
         # Rounding grows where a search wanders: a few may end elsewhere.
         same = np.abs(one.commands - two.commands).max(axis=0) < 1e-7
         assert same.mean() > 0.97
@@ -67,7 +70,7 @@ def test_all_targets_are_answered_at_their_places(count: int) -> None:
 
 def test_no_targets_have_no_answers() -> None:
     pair = Pair("three", False)
-    assert pair.compiled(pair.goal(0), QUICK, NEAR).commands.shape == (3, 0)
+    assert pair.compiled.exactly(pair.goal(0), QUICK).commands.shape == (3, 0)
 
 
 @pytest.mark.parametrize(("name", "turns"), [("three", False), ("rigid", False), ("lift", True), ("lrm", True)])
@@ -93,13 +96,13 @@ def test_preferred_commands() -> None:
 def test_numbers_that_are_none_end_a_search_and_touch_no_other() -> None:
     pair = Pair("three", False)
     goal = pair.goal(20)
-    sound = pair.compiled(goal, QUICK, NEAR)
+    sound = pair.compiled.exactly(goal, QUICK)
     target = goal.target.copy()
     target[:, 5] = np.nan
     target[0, 11] = np.inf
     record, state = goal.record.copy(), goal.state.copy()
     record[1, 13], state[0, 14], state[1, 15] = np.nan, np.nan, np.inf
-    answer = pair.compiled(replace(goal, record=record, target=target, state=state), QUICK, NEAR)
+    answer = pair.compiled.exactly(replace(goal, record=record, target=target, state=state), QUICK)
     others = np.delete(np.arange(20), [5, 11, 13, 14, 15])
     assert not answer.there[[5, 11, 13]].any()
     assert (answer.commands[:, others] == sound.commands[:, others]).all()
@@ -110,7 +113,7 @@ def test_arrays_are_read_however_they_are_stored() -> None:
     pair = Pair("three", False)
     goal = pair.goal(30)
     turned = replace(goal, record=np.asfortranarray(goal.record), target=np.asfortranarray(goal.target))
-    assert (pair.compiled(turned, QUICK, NEAR).commands == pair.compiled(goal, QUICK, NEAR).commands).all()
+    assert (pair.compiled.exactly(turned, QUICK).commands == pair.compiled.exactly(goal, QUICK).commands).all()
 
 
 def test_other_shapes_are_refused() -> None:
@@ -119,9 +122,9 @@ def test_other_shapes_are_refused() -> None:
     goal = pair.goal(4)
     for name, wrong in (("record", goal.record[:-1]), ("target", goal.target[:, :3]), ("state", goal.state[:, :1])):
         with pytest.raises(ValueError, match=f"found {name} of the shape"):
-            pair.compiled(replace(goal, **{name: wrong}), QUICK, NEAR)
+            pair.compiled.exactly(replace(goal, **{name: wrong}), QUICK)
     with pytest.raises(ValueError, match=r"found towards of the shape \(3, 1\), expected \(3, 4\)"):
-        pair.compiled(replace(goal, towards=np.zeros((3, 1))), QUICK, NEAR)
+        pair.compiled.exactly(replace(goal, towards=np.zeros((3, 1))), QUICK)
 
 
 def test_neighbours_do_not_matter() -> None:
@@ -133,15 +136,15 @@ def test_neighbours_do_not_matter() -> None:
     wild[:3, ::8] = 1e6
     order = np.random.default_rng(0).permutation(61)
     for search in (pair.compiled, pair.interpreted):
-        answer = search(goal, PREFERRED, NEAR)
-        turned = search(goal.subset(order), PREFERRED, NEAR)
-        beside = search(replace(goal, record=wild), PREFERRED, NEAR)
+        answer = search.exactly(goal, PREFERRED)
+        turned = search.exactly(goal.subset(order), PREFERRED)
+        beside = search.exactly(replace(goal, record=wild), PREFERRED)
         for name in ("commands", "states", "distances", "there"):
             whole = getattr(answer, name)
             assert (getattr(turned, name) == whole[..., order]).all()
             assert (np.delete(getattr(beside, name) == whole, np.arange(0, 61, 8), axis=-1)).all()
             for i in range(0, 61, 10):
-                alone = search(goal.subset(np.array([i])), PREFERRED, NEAR)
+                alone = search.exactly(goal.subset(np.array([i])), PREFERRED)
                 assert (getattr(alone, name)[..., 0] == whole[..., i]).all()
 
 
@@ -150,27 +153,28 @@ def test_several_threads_may_search_at_once() -> None:
     pair = Pair("three", False)
     goals = [pair.goal(203, stretch) for stretch in (1.0, 0.9, 1.1, 3.0)] * 4
     with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda goal: pair.compiled(goal, QUICK, NEAR).commands, goals))
+        together = list(threads.map(lambda goal: pair.compiled.exactly(goal, QUICK).commands, goals))
     for goal, found in zip(goals, together, strict=True):
-        assert (found == pair.compiled(goal, QUICK, NEAR).commands).all()
+        assert (found == pair.compiled.exactly(goal, QUICK).commands).all()
 
 
 @pytest.mark.parametrize("kind", ["compiled", "interpreted"])
 @pytest.mark.slow
 def test_what_counts_as_there_is_what_is_given(kind: str) -> None:
     """Not an earlier step that moved less but was not at rest, or was turned too far: a few of 1000 have such steps."""
-    pair, near = Pair("lrm", True), Near(metres=1e-9, radians=1e-8, rest=1e-11)
+    near = (1e-9, 1e-8)
+    pair = Pair("lrm", True, near=near)
     goal = pair.goal(1000)
-    found = getattr(pair, kind)(replace(goal, towards=drawn(pair.found, 1000, seed=3).T), PREFERRED, near)
+    found = getattr(pair, kind).exactly(replace(goal, towards=drawn(pair.found, 1000, seed=3).T), PREFERRED)
     record, free = goal.record.copy(), np.ones((6, 1000))
     record[:6] = found.commands
     expression = pair.found.expression
     step = step_function(expression, slopes(expression), "pose").map(1000)
     answers = step(record, goal.target, 0 * free, free, free[:1], LENGTH * free[:1], found.states)
     _, left, _, error, _ = (each.full()[:, found.there] for each in answers)
-    assert np.linalg.norm(error[:3], axis=0).max() <= near.metres
-    assert np.linalg.norm(error[3:], axis=0).max() <= near.radians
-    assert np.abs(left).max() <= near.rest
+    assert np.linalg.norm(error[:3], axis=0).max() <= near[0]
+    assert np.linalg.norm(error[3:], axis=0).max() <= near[1]
+    assert np.abs(left).max() <= REST
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.calibration.measured_point import measured_point
+from armcal.calibration.tool_expression import measured_point
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal.plugins import discover

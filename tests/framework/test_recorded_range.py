@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.calibration.recorded_range import beyond_records, recorded_ranges
+from armcal.calibration.intervals import beyond_records, recorded_ranges
 
 ARMS: Any = {"arm": SimpleNamespace(command_channels={"arm.q1": "angle", "arm.rail": "length"})}
 

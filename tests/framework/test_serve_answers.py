@@ -18,7 +18,7 @@ from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.calibration.compensation import Commands
-from armcal.calibration.recorded_range import beyond_records
+from armcal.calibration.intervals import beyond_records
 from armcal.errors import ConfigError, DataError
 from armcal_serve.answers import Answerer, command_rows
 from armcal_serve.loading import Loader

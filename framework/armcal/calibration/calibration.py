@@ -1,5 +1,7 @@
 """A calibration as a file: everything needed to use it, check it and go on from it."""
 
+import math
+import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,26 +15,36 @@ from armcal.base.config_text import plain
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import identity
-from armcal.calibration.calibration_file import CalibrationFile, identity_of, lost_calibration, read_record
-from armcal.calibration.compensation import Commands, Compensator, Options
-from armcal.calibration.intervals import PlusMinus, Uncertainty
-from armcal.calibration.measured_point import Point, tool_point
-from armcal.calibration.physics import (
+from armcal.calibration.calibration_file import (
     SHARE,
     UNSTATED_M,
+    CalibrationFile,
     check_record,
     components,
     differences,
+    identity_of,
+    lost_calibration,
     movement,
     predict,
+    read_record,
     readable,
     require_present,
 )
-from armcal.calibration.tool_expression import ToolExpression, arm_expression
+from armcal.calibration.compensation import Commands, Compensator, Options
+from armcal.calibration.intervals import PlusMinus, Uncertainty
+from armcal.calibration.tool_expression import Point, ToolExpression, arm_expression, tool_point
 from armcal.config.system import System, build_system
 from armcal.config.validate import validate
 from armcal.config.yaml_source import ConfigSource
-from armcal.errors import ArmcalError, CalibrationWarning, ConfigError, DataError, Location, NotConvergedError
+from armcal.errors import (
+    ArmcalError,
+    CalibrationWarning,
+    ConfigError,
+    DataError,
+    InputError,
+    Location,
+    NotConvergedError,
+)
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
 from armcal.plugins import PluginRegistry, discover
@@ -438,3 +450,51 @@ def _check_values(record: CalibrationFile, source: ConfigSource) -> None:
                 where=where,
                 hint="Write the same number for nominal and value.",
             )
+
+
+_MODEL_ZERO = re.compile(r"(theta|offset)(\d+)")
+
+
+@dataclass(frozen=True)
+class Zero:
+    """How far a joint stands from its command at zero (deg), with its standard deviation."""
+
+    degrees: float
+    sd_deg: float
+
+
+def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dict[str, Zero], dict[str, str]]:
+    """The zeros that a calibration found, by joint; and joints without one, with the reason.
+
+    A zero is what a joint effect states as one (``JointEffect.zeros``), as it stands, and what a model's own ``theta``
+    or ``offset`` differs from its drawing.
+
+    Raises:
+        ConfigError: the calibration is refused.
+        InputError: it has no zero, or several arms and none was named.
+    """
+    loaded, where = Calibration.load(path, registry), Location(str(path))
+    arms = loaded.system.arms
+    if arm not in arms and (arm is not None or len(arms) > 1):
+        raise InputError(f"found the arms {', '.join(arms)}.", where=where, hint="Choose one with --arm-name NAME.")
+    chosen = arms[arm or next(iter(arms))]
+    stated = {f"{chosen.name}.{n}.{p}": j for n, effect in chosen.effects.items() for p, j in effect.zeros().items()}
+    zeros: dict[str, Zero] = {}
+    reasons = dict.fromkeys(chosen.commanded, "its zero was not free")
+    for entry in loaded.record.parameters:
+        match = _MODEL_ZERO.fullmatch(entry.name.removeprefix(f"{chosen.name}.{chosen.model_name}."))
+        number = stated.get(entry.name, int(match[2]) if match and entry.unit == "rad" else 0)
+        if not number or (joint := chosen.joint_names[number - 1]) not in chosen.commanded:
+            continue
+        if entry.free and (entry.sd is None or entry.determined_by != "data"):
+            reasons[joint] = f"the records do not determine {entry.name}"
+            continue
+        value = entry.value if entry.name in stated else entry.value - entry.nominal
+        if entry.free or (entry.name in stated and value):
+            before = zeros.get(joint, Zero(0.0, 0.0))
+            sd = math.hypot(before.sd_deg, math.degrees(entry.sd or 0.0))
+            zeros[joint] = Zero(before.degrees + math.degrees(value), sd)
+    if not zeros:
+        hint = "Free them in parameters.free (arm.EFFECT.offset*, of an effect servo_map), and run again."
+        raise InputError("found no calibrated zero of a joint.", where=where, hint=hint)
+    return zeros, {joint: reason for joint, reason in reasons.items() if joint not in zeros}

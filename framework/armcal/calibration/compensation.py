@@ -21,15 +21,32 @@ from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm, within_couplings
 from armcal.arm.joints import Limits, joint_limits
+from armcal.arm.servo import PulseClock, PulseTable
 from armcal.arm.statics import LOAD_CHANNELS, Environment
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.parameters import Parameters
 from armcal.base.se3 import Transform, evaluated, identity
-from armcal.calibration.counts import Rounding, ServoCounts
-from armcal.calibration.inverse import FARTHEST_M, Aim, Allowed, Finder, Seeds, Solutions, Solver, chosen_of
+from armcal.calibration.inverse import (
+    FARTHEST_M,
+    Aim,
+    Allowed,
+    Finder,
+    Seeds,
+    Solutions,
+    Solver,
+    chosen_of,
+    slope_function,
+)
 from armcal.calibration.rigid_chain import turn_between
-from armcal.calibration.tool_expression import APPROACH, Equilibrium, Standing, ToolExpression, arm_expression
-from armcal.functions.batch_function import EvaluatorChoice
+from armcal.calibration.tool_expression import (
+    APPROACH,
+    Equilibrium,
+    Standing,
+    ToolExpression,
+    arm_expression,
+    sample_inputs,
+)
+from armcal.functions.batch_function import BatchFunction, EvaluatorChoice
 
 _ORTHOGONAL = 1e-6
 
@@ -241,69 +258,6 @@ _ROUNDS = 3
 _STILL = 1e-9  # A joint that moves by less (rad or m) keeps its side
 
 
-@dataclass(frozen=True)
-class Path:
-    """Commands along a path.
-
-    Attributes:
-        moves: of each joint to each target from the one before it (n x N; rad or m; 0 for the first without a start).
-    """
-
-    solutions: Solutions  # the commands for each target
-    approach: Array  # from where each joint came (n x N)
-    moves: Array
-
-
-class PathFinder:
-    """Follows targets, one after another."""
-
-    def __init__(self, finder: Finder, joints: int, tells_approach: bool) -> None:
-        """``tells_approach``: whether it matters from where a joint comes."""
-        self._finder, self._joints, self._tells_approach = finder, joints, tells_approach
-
-    def __call__(self, record: Array, target: Array, start: Array | None) -> Iterator[Path | None]:
-        """Follow targets (3 or 12 x N) under records (channels x N) from commands (n), or from wherever is best.
-
-        None after each target, for a server with other clients; the path at last.
-        """
-        at = start[:, None] if start is not None else self._finder.postures(record[:, :1], target[:, :1], _STARTS)[0]
-        at = at[:, :_POSTURES] if at.size else self._finder.first(record[:, :1], target[:, :1]).commands
-        count, wide = target.shape[1], at.shape[1]
-        solutions: list[Solutions] = []
-        sides = np.zeros((count, self._joints, wide))
-        moves = np.zeros((count, self._joints, wide))
-        side, spoilt = np.zeros_like(at), np.zeros(wide, dtype=int)
-        for i in range(count):
-            rows = np.full(wide, i)
-            if i == 0 and start is None:
-                following = self._finder.onward(record[:, rows], target[:, rows], at)
-            else:
-                following, side = self._next(record[:, rows], target[:, rows], at, side)
-                moves[i], sides[i] = following.commands - at, side
-            solutions.append(following)
-            at = following.commands
-            spoilt += (np.abs(moves[i]).max(axis=0) > _JUMP).astype(int) + ~following.there
-            kept = np.asarray(spoilt == spoilt.min())
-            if not kept.all():
-                solutions = [candidates.subset(kept) for candidates in solutions]
-                sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
-                wide, spoilt = int(kept.sum()), spoilt[kept]
-            yield None
-        longest = np.abs(moves).max(axis=1)
-        best = int((longest.max(axis=0) + longest.mean(axis=0)).argmin())
-        columns = zip(*(vars(candidates).values() for candidates in solutions), strict=True)
-        along = Solutions(*(np.stack([column[..., best] for column in part], axis=-1) for part in columns))
-        yield Path(along, sides[:, :, best].T, moves[:, :, best].T)
-
-    def _next(self, record: Array, target: Array, at: Array, side: Array) -> tuple[Solutions, Array]:
-        if not self._tells_approach:
-            solutions = self._finder.onward(record, target, at)
-            return solutions, sides_of(solutions.commands - at, side)
-        record = record.copy()
-        solutions = with_sides(record, at, side, lambda sided: self._finder.onward(sided, target, at))
-        return solutions, record[self._joints : 2 * self._joints]
-
-
 def sides_of(moved: Array, before: Array) -> Array:
     """The side (-1, 0, 1) from which joints come that moved so far, and came from a side before (n x N each)."""
     return np.where(np.abs(moved) > _STILL, np.sign(moved), before)
@@ -332,6 +286,161 @@ def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array]
         record[place] = sides
     record[place] = np.where(sides == side_record, side_record, 0.0)
     return search(record)
+
+
+Counts = NDArray[np.int64]
+_MOST_PAIRS = 20_000
+_WIDEST = 2  # Counts to either side of the exact one
+_ROUNDED_AT_ONCE = 64
+TRIED = 4  # Combinations that are tried on the arm
+
+
+class ServoCounts:
+    """From commands to counts and back, for joints of which some have a servo."""
+
+    def __init__(self, joints: Sequence[str], servos: Mapping[str, tuple[PulseTable, PulseClock]]) -> None:
+        self._servos = [servos.get(joint) for joint in joints]
+        self._stepped = [i for i, servo in enumerate(self._servos) if servo is not None]
+        wide = _WIDEST
+        while wide > 1 and (2 * wide + 1) ** len(self._stepped) > _MOST_PAIRS:
+            wide -= 1
+        self._offsets = np.arange(-wide, wide + 1)
+
+    def counts(self, commands: Array) -> Counts:
+        """The whole counts nearest to commands (n x N; rad)."""
+        whole = np.zeros(commands.shape, dtype=np.int64)
+        for i, servo in enumerate(self._servos):
+            if servo is not None:
+                table, clock = servo
+                whole[i] = np.floor(_piecewise(commands[i], table.angles, table.pulses) / clock.tick + 0.5)
+        return whole
+
+    def angles(self, counts: Counts, commands: Array) -> Array:
+        """What counts make (n x N; rad); joints without a pulse table stand at their commands."""
+        made = commands.copy()
+        for i, servo in enumerate(self._servos):
+            if servo is not None:
+                table, clock = servo
+                order = slice(None) if table.pulses[0] < table.pulses[-1] else slice(None, None, -1)
+                made[i] = _piecewise(counts[i] * clock.tick, table.pulses[order], table.angles[order])
+        return made
+
+    def near(self, commands: Array, limits: Array) -> tuple[Counts, Array]:
+        """Counts to either side of commands (n x N), and what they make (n x o x N each; rad).
+
+        None beyond the limits (n x 2), where the nearest stands in.
+        """
+        middle = self.counts(commands)
+        moved = np.where(middle[:, None, :] == 0, 0, self._offsets[None, :, None])
+        counts = middle[:, None, :] + moved
+        exact = np.repeat(commands[:, None, :], len(self._offsets), axis=1)
+        shape = (len(commands), -1)
+        angles = self.angles(counts.reshape(shape), exact.reshape(shape)).reshape(counts.shape)
+        slack = 1e-9
+        beyond = (angles < limits[:, :1, None] - slack) | (angles > limits[:, 1:, None] + slack)
+        inside = np.where(beyond, np.inf, np.abs(angles - exact)).argmin(axis=1, keepdims=True)
+        counts = np.where(beyond, np.take_along_axis(counts, inside, axis=1), counts)
+        angles = np.where(beyond, np.take_along_axis(angles, inside, axis=1), angles)
+        return counts, angles
+
+    def best(self, near: tuple[Counts, Array], commands: Array, slopes: Array, left: Array) -> tuple[Counts, Array]:
+        """The combinations with the least error to first order.
+
+        Args:
+            near: what can be set about the commands, as ``near`` has it.
+            commands: the exact ones (n x N).
+            slopes: of the tool, its weighted rows (N x m x n).
+            left: what the exact commands leave (m x N).
+
+        Returns:
+            counts and angles (n x N x TRIED), the best first.
+        """
+        counts, angles = near
+        moved = (angles - commands[:, None, :]).transpose(2, 0, 1)
+        half = (len(self._stepped) + 1) // 2
+        parts = self._stepped[:half], self._stepped[half:]
+        first, second = (_sums(slopes, moved, part) for part in parts)
+        aim = left.T[:, None, :] - first[0]
+        cost = np.einsum("nai,nai->na", aim, aim)[:, :, None] - 2 * aim @ second[0].transpose(0, 2, 1)
+        cost += np.einsum("nbi,nbi->nb", second[0], second[0])[:, None, :]
+        flat = cost.reshape(len(cost), -1)
+        few = np.argpartition(flat, min(TRIED, flat.shape[1] - 1), axis=1)[:, :TRIED]
+        chosen = np.concatenate([first[1][few // cost.shape[2]], second[1][few % cost.shape[2]]], axis=2)
+        place = np.full((len(commands), *few.shape), len(self._offsets) // 2)
+        place[self._stepped] = chosen.transpose(2, 0, 1)
+        joint, target = np.arange(len(commands))[:, None, None], np.arange(len(cost))[None, :, None]
+        return counts[joint, place, target], angles[joint, place, target]
+
+
+def _sums(slopes: Array, moved: Array, joints: Sequence[int]) -> tuple[Array, Indices]:
+    """What all combinations of some joints' offsets do (N x combinations x m), and the combinations."""
+    wide = moved.shape[2]
+    places = np.indices((wide,) * len(joints)).reshape(len(joints), wide ** len(joints)).T
+    total = np.zeros((len(moved), len(places), slopes.shape[1]))
+    for column, joint in enumerate(joints):
+        effect = moved[:, joint, :, None] * slopes[:, None, :, joint]
+        total += effect[:, places[:, column]]
+    return total, places
+
+
+def _piecewise(x: Array, at: Sequence[float], values: Sequence[float]) -> Array:
+    knots, known = np.asarray(at), np.asarray(values)
+    cell = np.clip(np.searchsorted(knots, x) - 1, 0, len(knots) - 2)
+    slope = (known[cell + 1] - known[cell]) / (knots[cell + 1] - knots[cell])
+    return np.asarray(known[cell] + slope * (x - knots[cell]))
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """The best counts, for the targets of a solver.
+
+    The tool's error is nearly linear over a few counts, so the joints are split in two halves, all combinations of
+    each half are laid out, and the pairs of them that cancel best are tried on the arm itself.
+    """
+
+    slope: BatchFunction  # see ``slope_function``
+    counts: ServoCounts
+    equilibrium: Equilibrium
+    solver: Solver
+
+    def __call__(
+        self, record: Array, solutions: Solutions, target: Array, allowed: Allowed | None
+    ) -> tuple[Counts, Array]:
+        """Counts and what they make (n x N each) for records with the exact commands, and targets (3 or 12 x N)."""
+        counts, commands = np.zeros(solutions.commands.shape, dtype=np.int64), np.zeros_like(solutions.commands)
+        for start in range(0, record.shape[1], _ROUNDED_AT_ONCE):
+            part = slice(start, start + _ROUNDED_AT_ONCE)
+            some = solutions.commands[:, part], solutions.states[:, part], target[:, part]
+            counts[:, part], commands[:, part] = self._part(record[:, part], *some, allowed)
+        return counts, commands
+
+    def _part(
+        self, record: Array, exact: Array, states: Array, target: Array, allowed: Allowed | None
+    ) -> tuple[Counts, Array]:
+        joints, count = exact.shape
+        left = _left(self.equilibrium(record, states).base_T_tool, target)
+        weights = np.array([1.0] * 3 + [self.solver.length] * (len(left) - 3))[:, None]
+        weighted = self.slope(record, states)[0].reshape(joints, len(left), count).transpose(2, 1, 0) * weights
+        near = self.counts.near(exact, self.solver.limits)
+        counts, commands = self.counts.best(near, exact, weighted, left * weights)
+        tried = np.repeat(record, TRIED, axis=1)
+        tried[:joints] = commands.reshape(joints, -1)
+        standing = self.equilibrium(tried, np.repeat(states, TRIED, axis=1))
+        away = _left(standing.base_T_tool, np.repeat(target, TRIED, axis=1))
+        cost = ((away * weights) ** 2).sum(axis=0)
+        barred = ~standing.settled if allowed is None else ~(standing.settled & allowed(tried[:joints]))
+        best = np.where(barred, np.inf, cost).reshape(count, TRIED).argmin(axis=1)
+        rows = np.arange(count)
+        return counts[:, rows, best], commands[:, rows, best]
+
+
+def _left(tools: Array, target: Array) -> Array:
+    """From tools (N x 4 x 4) to targets (3 or 12 x N): m, and rad in the base frame (3 or 6 x N)."""
+    away = target[:3] - tools[:, :3, 3].T
+    if len(target) == len(away):
+        return np.asarray(away)
+    rotations = target[3:].T.reshape(-1, 3, 3).transpose(0, 2, 1)
+    return np.concatenate([away, turn_between(tools[:, :3, :3], rotations).T])
 
 
 SEEDS = 512
@@ -378,7 +487,7 @@ class Compensator:
         self._counts = ServoCounts(expression.joints, expression.servos) if expression.servos else None
         self._seeds = Seeds(expression, self._equilibrium, self.limits, SEEDS, self.options.seed)
         self._choice: EvaluatorChoice = choice
-        self._positions, self._poses = _TargetKind(self, "position"), _TargetKind(self, "pose")
+        self._kinds: dict[Aim, tuple[Finder, Rounding | None]] = {}
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -442,7 +551,7 @@ class Compensator:
 
     def postures(self, targets: Targets, starts: int = _STARTS) -> list[Array]:
         """The commands of all postures that are found of each target from so many starts (n x k each)."""
-        return self._kind(targets).finder.postures(self._record(targets), _goal(targets), starts)
+        return self._finder(targets).postures(self._record(targets), _goal(targets), starts)
 
     def follow(self, targets: Targets, start: Array | None = None) -> Commands:
         """Commands along a path: one target after another, without jumps where that can be.
@@ -463,24 +572,53 @@ class Compensator:
         Raises:
             ValueError: as of ``solve``.
         """
-        record = self._record(targets)
-        finder = PathFinder(self._kind(targets).finder, len(self.joints), self._tells_approach)
-        at = None if start is None else self._commanded(start, 1)[:, 0]
-        path = None
-        for step in finder(record, _goal(targets), at):
-            path = step
+        record, goal, finder = self._record(targets), _goal(targets), self._finder(targets)
+        if start is None:
+            at = finder.postures(record[:, :1], goal[:, :1], _STARTS)[0]
+            at = at[:, :_POSTURES] if at.size else finder.first(record[:, :1], goal[:, :1]).commands
+        else:
+            at = self._commanded(start, 1)
+        count, wide, found = len(targets), at.shape[1], list[Solutions]()
+        moves, sides = np.zeros((count, *at.shape)), np.zeros((count, *at.shape))
+        side, spoilt = np.zeros_like(at), np.zeros(wide, dtype=int)
+        for i in range(count):
+            rows = np.full(wide, i)
+            if i == 0 and start is None:
+                found.append(finder.onward(record[:, rows], goal[:, rows], at))
+            else:
+                solutions, side = self._next(finder, record[:, rows], goal[:, rows], at, side)
+                found.append(solutions)
+                moves[i], sides[i] = solutions.commands - at, side
+            at = found[-1].commands
+            spoilt += (np.abs(moves[i]).max(axis=0) > _JUMP).astype(int) + ~found[-1].there
+            kept = np.asarray(spoilt == spoilt.min())
+            if not kept.all():
+                found = [candidates.subset(kept) for candidates in found]
+                sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
+                wide, spoilt = int(kept.sum()), spoilt[kept]
             yield None
-        assert path is not None
-        record[len(self.joints) : 2 * len(self.joints)] = path.approach
-        for first in range(0, len(targets), PART):
-            rows = np.arange(first, min(first + PART, len(targets)))
-            part = self._commands(chosen_of(record, rows), targets.subset(rows), path.solutions.subset(rows))
-            yield replace(part, moves=path.moves[:, rows].T)
+        longest = np.abs(moves).max(axis=1)
+        best = int((longest.max(axis=0) + longest.mean(axis=0)).argmin())
+        record[len(self.joints) : 2 * len(self.joints)] = sides[:, :, best].T
+        for first in range(0, count, PART):
+            rows = np.arange(first, min(first + PART, count))
+            along = Solutions.joined([found[row].subset(slice(best, best + 1)) for row in rows])
+            part = self._commands(chosen_of(record, rows), targets.subset(rows), along)
+            yield replace(part, moves=moves[rows, :, best])
+
+    def _next(self, finder: Finder, record: Array, goal: Array, at: Array, side: Array) -> tuple[Solutions, Array]:
+        """A step along a path from commands to which joints came from sides (n x N each)."""
+        if not self._tells_approach:
+            solutions = finder.onward(record, goal, at)
+            return solutions, sides_of(solutions.commands - at, side)
+        record = record.copy()
+        solutions = with_sides(record, at, side, lambda sided: finder.onward(sided, goal, at))
+        return solutions, record[len(at) : 2 * len(at)]
 
     def onward(self, targets: Targets, at: Array) -> Commands:
         """Commands for targets straight on from others (N x n): no other posture is looked for."""
         record = self._record(targets)
-        solutions = self._kind(targets).finder.straight(record, _goal(targets), self._commanded(at, len(targets)))
+        solutions = self._finder(targets).straight(record, _goal(targets), self._commanded(at, len(targets)))
         return self._commands(record, targets, solutions)
 
     def forward(
@@ -531,14 +669,14 @@ class Compensator:
 
     def _found(self, record: Array, targets: Targets, start: Array | None) -> Solutions:
         """Exact commands: the nearest to those from which the arm comes, or the first that are found."""
-        finder = self._kind(targets).finder
+        finder = self._finder(targets)
         return finder.first(record, _goal(targets)) if start is None else finder.onward(record, _goal(targets), start)
 
     def _commands(self, record: Array, targets: Targets, solutions: Solutions) -> Commands:
         """What is commanded: exact, or the best counts; and where that leads."""
         joints, counts = len(self.joints), None
         record[:joints] = solutions.commands
-        rounding = self._kind(targets).rounding
+        rounding = self._kind("position" if targets.rotations is None else "pose")[1]
         if rounding is not None:
             counts, record[:joints] = rounding(record, solutions, _goal(targets), self._allowed)
             if self._allowed is not None:
@@ -574,7 +712,7 @@ class Compensator:
         lost, turned = np.flatnonzero(~had), np.zeros(len(had), dtype=bool)
         near = lost[(bounds[lost] == 0) & ~solutions.forbidden[lost]]
         if targets.rotations is not None and near.size:
-            turned[near] = self._positions.finder.first(record[:, near], targets.positions[near].T).there
+            turned[near] = self._kind("position")[0].first(record[:, near], targets.positions[near].T).there
         reasons = [""] * len(had)
         for row in lost.tolist():
             if solutions.there[row]:
@@ -604,39 +742,29 @@ class Compensator:
             record[self.expression.channels.index(name)] = values
         return record
 
-    def _kind(self, targets: Targets) -> _TargetKind:
-        return self._positions if targets.rotations is None else self._poses
+    def _finder(self, targets: Targets) -> Finder:
+        return self._kind("position" if targets.rotations is None else "pose")[0]
+
+    def _kind(self, aim: Aim) -> tuple[Finder, Rounding | None]:
+        """What finds commands for one kind of target, and rounds them to counts of servos; made when first used."""
+        if aim not in self._kinds:
+            tolerance = (self.options.reach_m, self.options.reach_rad)
+            parts = (self.limits, aim, self._seeds.spread / 2, tolerance, self._choice)
+            finder = Finder(Solver(self.expression, *parts), self._seeds, self._allowed)
+            rounding, turns = None, aim == "pose"
+            if self._counts is not None:
+                sample, choice = sample_inputs(self.expression), self._choice
+                make = partial(BatchFunction, slope_function(self.expression, turns), sample, choice)
+                slope = self.expression.made(("slope", turns, choice), make)
+                rounding = Rounding(slope, self._counts, self._equilibrium, finder.solver)
+            self._kinds[aim] = finder, rounding
+        return self._kinds[aim]
 
     @cached_property
     def _tells_approach(self) -> bool:
         """Whether it matters from where a joint comes."""
         names = [f"{APPROACH}{joint}" for joint in self.joints]
         return self.expression.uses(names)
-
-
-class _TargetKind:
-    """What finds commands for one kind of target; each part is made when it is first used."""
-
-    def __init__(self, arm: Compensator, aim: Aim) -> None:
-        self._arm, self._aim = arm, aim
-
-    @cached_property
-    def solver(self) -> Solver:
-        arm, options = self._arm, self._arm.options
-        tolerance, length = (options.reach_m, options.reach_rad), arm._seeds.spread / 2
-        return Solver(arm.expression, arm.limits, self._aim, length, tolerance, arm._choice)
-
-    @cached_property
-    def finder(self) -> Finder:
-        return Finder(self.solver, self._arm._seeds, self._arm._allowed)
-
-    @cached_property
-    def rounding(self) -> Rounding | None:
-        """To counts of servos; None where there are none."""
-        arm = self._arm
-        if arm._counts is None:
-            return None
-        return Rounding(arm.expression, arm._counts, arm._equilibrium, self.solver, arm._choice)
 
 
 def _goal(targets: Targets) -> Array:

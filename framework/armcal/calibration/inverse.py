@@ -21,7 +21,7 @@ are left.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import reduce
 from itertools import accumulate
@@ -327,7 +327,11 @@ class Solutions:
         self.commands[:, at], self.states[:, at] = attempt.commands[:, chosen], attempt.states[:, chosen]
         self.distances[at], self.turns[at] = attempt.distances[chosen], attempt.turns[chosen]
 
-    def subset(self, chosen: Mask | Indices) -> Solutions:
+    @classmethod
+    def joined(cls, parts: Sequence[Solutions]) -> Solutions:
+        return cls(*(np.concatenate([getattr(p, f.name) for p in parts], axis=-1) for f in fields(cls)))
+
+    def subset(self, chosen: Mask | Indices | slice) -> Solutions:
         return Solutions(*(getattr(self, part.name)[..., chosen] for part in fields(self)))
 
     def replace(self, at: Indices, other: Solutions) -> None:
@@ -350,74 +354,8 @@ NEAREST = Manner(damping=1.0, patience=25, steps=100)
 PREFERRED = Manner(damping=1e-2, patience=20, steps=100)  # Along targets towards preferred commands
 
 
-@dataclass(frozen=True)
-class Near:
-    """What counts as being there."""
-
-    metres: float  # from the target
-    radians: float  # from the target
-    rest: float  # what may be left of the equilibrium (rad or m)
-
-
 _REST = 1e-11
-_ROUGH = Near(metres=1e-3, radians=5e-3, rest=1e-2)  # Where rough steps end
-
-
-class Search:
-    """Searches by one form of a step, of one arm and kind of target."""
-
-    def __init__(
-        self,
-        expression: ToolExpression,
-        limits: Array,
-        aim: Aim,
-        length: float,
-        choice: EvaluatorChoice = "auto",
-        rough: bool = False,
-    ) -> None:
-        """Limits are n x 2 (rad or m); a radian counts as ``length`` metres; ``rough`` as of ``slopes``."""
-
-        def made() -> BatchFunction:
-            function = search_function(expression, slopes(expression, rough), aim)
-            random, record = np.random.default_rng(0), sample_inputs(expression)[0]
-            sample = [random.uniform(0.1, 0.3, (function.numel_in(i), 8)) for i in range(function.n_in())]
-            sample[1] = record
-            return BatchFunction(function, sample, choice, iterated=True)
-
-        self._iteration = expression.made(("search", aim, rough, choice), made)
-        self._limits, self._places = limits, progress_places(len(limits), expression.state.numel())
-        self._length = length
-        function = self._iteration.function
-        self._sizes = [*(function.numel_in(i) for i in (1, 2, 3)), expression.state.numel()]
-
-    @property
-    def compiled(self) -> bool:
-        return self._iteration.compiled
-
-    def __call__(self, goal: Goal, manner: Manner, near: Near) -> Solutions:
-        """Search until it is near, or no longer comes nearer.
-
-        Raises:
-            ValueError: an array of another shape.
-        """
-        joints, count, places = len(self._limits), goal.record.shape[1], self._places
-        towards = np.zeros((joints, count)) if goal.towards is None else goal.towards
-        given = {"record": goal.record, "target": goal.target, "towards": towards, "state": goal.state}
-        for (name, array), size in zip(given.items(), self._sizes, strict=True):
-            if array.shape != (size, count):
-                raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
-        stated = (manner.damping, manner.patience, manner.steps, near.metres, near.radians, near.rest)
-        settings = np.concatenate([stated, [goal.towards is not None, self._length], *self._limits.T])
-        progress = np.zeros((places["end"].stop, count))
-        begun = np.minimum(np.maximum(goal.record[:joints], self._limits[:, :1]), self._limits[:, 1:])
-        progress[places["commands"]] = progress[places["best_commands"]] = begun
-        progress[places["state"]] = progress[places["best_state"]] = goal.state
-        progress[places["free"]], progress[places["damping"]] = 1.0, FIRST_DAMPING
-        progress[places["distance"].start : places["milestone"].stop] = np.inf
-        self._iteration.iterate(progress, settings, goal.record, goal.target, towards)
-        best, (distances, turns) = progress[places["best_commands"]], progress[places["distance"].start :][:2]
-        there, forbidden = progress[-1] == REACHED, np.zeros(count, dtype=bool)
-        return Solutions(best, progress[places["best_state"]], distances, turns, there, forbidden)
+_ROUGH = (1e-3, 5e-3, 1e-2)  # Where rough steps end
 
 
 class Solver:
@@ -441,22 +379,65 @@ class Solver:
     ) -> None:
         """Targets are reached within tolerances in m and rad."""
         self.length, self.aim, self.limits, self.states = length, aim, limits, expression.state.numel()
-        self._near = Near(*tolerance, _REST)
-        parts = (expression, limits, aim, length, choice)
-        self._exact = Search(*parts)
-        self._rough = Search(*parts, rough=True) if self.states else None
+        self._near, self._places = (*tolerance, _REST), progress_places(len(limits), self.states)
+
+        def steps(rough: bool) -> BatchFunction:
+            def made() -> BatchFunction:
+                function = search_function(expression, slopes(expression, rough), aim)
+                random, record = np.random.default_rng(0), sample_inputs(expression)[0]
+                sample = [random.uniform(0.1, 0.3, (function.numel_in(i), 8)) for i in range(function.n_in())]
+                sample[1] = record
+                return BatchFunction(function, sample, choice, iterated=True)
+
+            return expression.made(("search", aim, rough, choice), made)
+
+        self._exact = steps(rough=False)
+        self._rough = steps(rough=True) if self.states else None
+
+    @property
+    def compiled(self) -> bool:
+        return self._exact.compiled
 
     def __call__(self, goal: Goal, manner: Manner = QUICK) -> Solutions:
         """Search from where the goal starts."""
         if self._rough is None:
-            return self._exact(goal, manner, self._near)
-        first = self._rough(replace(goal, towards=None), manner, _ROUGH)
+            return self.exactly(goal, manner)
+        first = self._search(self._rough, replace(goal, towards=None), manner, _ROUGH)
         near = np.flatnonzero(first.there) if manner is QUICK else np.arange(len(first.there))
         begun = replace(goal, record=with_commands(goal.record, first.commands), state=first.states)
-        second = self._exact(begun.subset(near), manner, self._near)
+        second = self.exactly(begun.subset(near), manner)
         first.there[:] = False
         first.replace(near, second)
         return first
+
+    def exactly(self, goal: Goal, manner: Manner) -> Solutions:
+        """Search by exact steps alone until it is near, or no longer comes nearer.
+
+        Raises:
+            ValueError: an array of another shape.
+        """
+        return self._search(self._exact, goal, manner, self._near)
+
+    def _search(self, steps: BatchFunction, goal: Goal, manner: Manner, near: tuple[float, float, float]) -> Solutions:
+        """``near`` is what counts as being there: m and rad from the target, and what is left of the equilibrium."""
+        joints, count, places = len(self.limits), goal.record.shape[1], self._places
+        towards = np.zeros((joints, count)) if goal.towards is None else goal.towards
+        given = {"record": goal.record, "target": goal.target, "towards": towards, "state": goal.state}
+        sizes = [*(steps.function.numel_in(i) for i in (1, 2, 3)), self.states]
+        for (name, array), size in zip(given.items(), sizes, strict=True):
+            if array.shape != (size, count):
+                raise ValueError(f"found {name} of the shape {array.shape}, expected {(size, count)}")
+        settings = [manner.damping, manner.patience, manner.steps, *near, goal.towards is not None, self.length]
+        progress = np.zeros((places["end"].stop, count))
+        begun = np.minimum(np.maximum(goal.record[:joints], self.limits[:, :1]), self.limits[:, 1:])
+        progress[places["commands"]] = progress[places["best_commands"]] = begun
+        progress[places["state"]] = progress[places["best_state"]] = goal.state
+        progress[places["free"]], progress[places["damping"]] = 1.0, FIRST_DAMPING
+        progress[places["distance"].start : places["milestone"].stop] = np.inf
+        steps.iterate(progress, np.concatenate([settings, *self.limits.T]), goal.record, goal.target, towards)
+        best, (distances, turns) = progress[places["best_commands"]], progress[places["distance"].start :][:2]
+        there, forbidden = progress[-1] == REACHED, np.zeros(count, dtype=bool)
+        return Solutions(best, progress[places["best_state"]], distances, turns, there, forbidden)
 
 
 def with_commands(record: Array, commands: Array) -> Array:
@@ -487,7 +468,7 @@ class Finder:
     """Commands for targets (SIZES x N) under records (channels x N, whose commands are not used), from many starts."""
 
     def __init__(self, solver: Solver, seeds: Seeds, allowed: Allowed | None) -> None:
-        self._solver, self._seeds, self._allowed = solver, seeds, allowed
+        self.solver, self._seeds, self._allowed = solver, seeds, allowed
 
     def first(self, record: Array, target: Array) -> Solutions:
         """The first commands that are found; of targets that are not reached, the nearest."""
@@ -508,11 +489,9 @@ class Finder:
         """All commands that are found of each target from so many starts (n x k each), the likeliest first."""
         wide, kept = min(count, self._seeds.commands.shape[1]), list[Array]()
         for todo in _chunks(np.arange(record.shape[1]), wide):
-            picks, rows = self._picked(target[:, todo], 0, wide).ravel(), np.repeat(todo, wide)
-            starts = chosen_of(self._seeds.commands, picks), chosen_of(self._seeds.states, picks)
-            attempt = self._solver(self._goal(record, target, rows, *starts))
-            good = attempt.there & self._may(attempt.commands)
-            for own in np.split(np.arange(len(rows)), len(todo)):
+            picks = self._picked(target[:, todo], 0, wide)
+            attempt, good = self._searched(record, target, todo, *self._seeds.at(picks))
+            for own in np.split(np.arange(picks.size), len(todo)):
                 kept.append(different(attempt.commands[:, own[good[own]]]))
         return kept
 
@@ -546,7 +525,7 @@ class Finder:
             attempts = self._nothing(len(rows))
             # Seeds near to targets, and near to commands too.
             moved = _apart(self._seeds.commands[:, None, :], at[:, todo, None])
-            cost = self._seeds.apart(target[:, todo], self._solver.length) + _MOVED * self._solver.length**2 * moved
+            cost = self._seeds.apart(target[:, todo], self.solver.length) + _MOVED * self.solver.length**2 * moved
             picks = np.argpartition(cost, wide - 1, axis=1)[:, :wide].reshape(-1, 1)
             records, targets, preferred = (chosen_of(array, rows) for array in (record, target, at))
             self._round(records, targets, np.arange(len(rows)), picks, attempts)
@@ -564,7 +543,7 @@ class Finder:
         """As near to preferred commands (n x N) as the targets allow, in place; only those that are reached."""
         at = np.flatnonzero(solutions.there)
         goal = Goal(with_commands(record, solutions.commands), solutions.states, target, preferred)
-        attempt = self._solver(goal.subset(at), PREFERRED)
+        attempt = self.solver(goal.subset(at), PREFERRED)
         nearer = _apart(attempt.commands, preferred[:, at]) < _apart(solutions.commands[:, at], preferred[:, at])
         good = np.flatnonzero(attempt.there & nearer & self._may(attempt.commands))
         solutions.put(at[good], attempt, good)
@@ -573,14 +552,14 @@ class Finder:
         """One search from commands (n x N), near to preferred ones where there are any: what it reaches."""
         solutions = self._nothing(record.shape[1])
         goal = Goal(with_commands(record, at), np.zeros_like(solutions.states), target, towards)
-        attempt = self._solver(goal, QUICK if towards is None else PREFERRED)
+        attempt = self.solver(goal, QUICK if towards is None else PREFERRED)
         good = np.flatnonzero(attempt.there & self._may(attempt.commands))
         solutions.replace(good, attempt.subset(good))
         return solutions
 
     def _picked(self, target: Array, used: int, wide: int) -> Indices:
         """The next seeds of each target (N x wide)."""
-        apart = self._seeds.apart(target, self._solver.length)
+        apart = self._seeds.apart(target, self.solver.length)
         if used == 0 and wide == 1:
             return np.asarray(apart.argmin(axis=1)[:, None])
         last = min(used + wide, apart.shape[1] - 1)
@@ -591,18 +570,15 @@ class Finder:
     def _round(self, record: Array, target: Array, todo: Indices, picks: Indices, solutions: Solutions) -> None:
         """Searches from seeds of each target (N x wide): what is reached, else what is nearest so far, in place."""
         wide = picks.shape[1]
-        rows, chosen = np.repeat(todo, wide), picks.ravel()
-        starts = chosen_of(self._seeds.commands, chosen), chosen_of(self._seeds.states, chosen)
-        attempt = self._solver(self._goal(record, target, rows, *starts))
-        good = attempt.there & self._may(attempt.commands)
-        left = attempt.distances + self._solver.length * attempt.turns
+        attempt, good = self._searched(record, target, todo, *self._seeds.at(picks))
+        left = attempt.distances + self.solver.length * attempt.turns
         best = np.where(good, left, np.inf).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
         had = good[best]
         solutions.put(todo[had], attempt, best[had])
         solutions.there[todo[had]] = True
         solutions.forbidden[todo] |= (attempt.there & ~good).reshape(-1, wide).any(axis=1)
         near = np.where(attempt.there, np.inf, left).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
-        closer = ~had & (left[near] < solutions.distances[todo] + self._solver.length * solutions.turns[todo])
+        closer = ~had & (left[near] < solutions.distances[todo] + self.solver.length * solutions.turns[todo])
         solutions.put(todo[closer], attempt, near[closer])
 
     def _nearest(self, record: Array, target: Array, lost: Indices, solutions: Solutions) -> None:
@@ -610,22 +586,28 @@ class Finder:
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):
             picks = self._picked(target[:, todo], 0, wide)
-            rows = np.repeat(todo, wide + 1)
-            commands = np.concatenate([solutions.commands[:, todo, None], self._seeds.commands[:, picks]], axis=2)
-            states = np.concatenate([solutions.states[:, todo, None], self._seeds.states[:, picks]], axis=2)
-            commands, states = (part.reshape(len(part), len(rows)) for part in (commands, states))
-            attempt = self._solver(self._goal(record, target, rows, commands, states), NEAREST)
-            left = attempt.distances + self._solver.length * attempt.turns
+            seeds, begun = self._seeds.at(picks), (solutions.commands, solutions.states)
+            starts = [
+                np.concatenate([own[:, todo, None], some], axis=2) for own, some in zip(begun, seeds, strict=True)
+            ]
+            attempt, _ = self._searched(record, target, todo, *starts, manner=NEAREST)
+            left = attempt.distances + self.solver.length * attempt.turns
             left = np.where(self._may(attempt.commands), left, np.inf)
             best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
             solutions.put(todo, attempt, best)
             solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])  # a longer search may arrive
 
-    def _goal(self, record: Array, target: Array, rows: Indices, commands: Array, states: Array) -> Goal:
-        return Goal(with_commands(chosen_of(record, rows), commands), states, chosen_of(target, rows))
+    def _searched(
+        self, record: Array, target: Array, todo: Indices, commands: Array, states: Array, manner: Manner = QUICK
+    ) -> tuple[Solutions, Mask]:
+        """Searches for some targets (N) from several starts each (n x N x wide); and which of them arrive."""
+        rows = np.repeat(todo, commands.shape[2])
+        starts = with_commands(chosen_of(record, rows), commands.reshape(len(commands), len(rows)))
+        attempt = self.solver(Goal(starts, states.reshape(len(states), len(rows)), chosen_of(target, rows)), manner)
+        return attempt, attempt.there & self._may(attempt.commands)
 
     def _nothing(self, count: int) -> Solutions:
-        return Solutions.nothing(len(self._solver.limits), len(self._seeds.states), count)
+        return Solutions.nothing(len(self.solver.limits), len(self._seeds.states), count)
 
     def _may(self, commands: Array) -> Mask:
         if self._allowed is None or not commands.shape[1]:
@@ -677,6 +659,10 @@ class Seeds:
     def spread(self) -> float:
         places = self._tools[:, :3, 3]
         return float(np.median(np.linalg.norm(places - places.mean(axis=0), axis=1)))
+
+    def at(self, picks: Indices) -> tuple[Array, Array]:
+        """Commands and states of some (n x and n_d x the shape of ``picks``)."""
+        return np.take(self.commands, picks, axis=1), np.take(self.states, picks, axis=1)
 
     def apart(self, targets: Array, length: float) -> Array:
         """How far each seed is from targets (3 or 12 x N), but for what is the same for all seeds (N x M; m^2)."""

@@ -17,8 +17,14 @@ from armcal.base.units import DIMENSIONLESS, UNITS, split_suffix
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.compensation import Commands, Compensator, Options, Reach, Sent, Targets, nominal_arm
 from armcal.calibration.inverse import FARTHEST_M
-from armcal.calibration.measured_point import MeasuredPoint, Point, measured_point, tool_point
-from armcal.calibration.tool_expression import APPROACH, ToolExpression
+from armcal.calibration.tool_expression import (
+    APPROACH,
+    MeasuredPoint,
+    Point,
+    ToolExpression,
+    measured_point,
+    tool_point,
+)
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.checks import noticed, records_of

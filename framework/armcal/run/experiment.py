@@ -34,7 +34,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.calibration.calibration_file import identity_of
-from armcal.calibration.recorded_range import PAYLOAD
+from armcal.calibration.intervals import PAYLOAD
 from armcal.config.selection import ParameterSettings, select, without_groups
 from armcal.config.system import StaticsSettings, System, build_component, build_system
 from armcal.config.validate import validate

@@ -15,11 +15,11 @@ from armcal.calibration.calibration_file import (
     SCHEMA,
     CalibrationFile,
     InformationRecord,
+    check_poses,
     dump,
     parameter_records,
     sealed,
 )
-from armcal.calibration.physics import check_poses
 from armcal.diagnose.verdict import evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.validation import in_unit

@@ -13,8 +13,7 @@ import numpy as np
 from armcal.arm.effects import JointEffect
 from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset, SetAside
-from armcal.calibration.intervals import PredictionRecord, covariance_rows
-from armcal.calibration.recorded_range import UNKNOWN, recorded_ranges
+from armcal.calibration.intervals import UNKNOWN, PredictionRecord, covariance_rows, recorded_ranges
 from armcal.diagnose.checks import DATA_CHECKS, first_few, plugin_checks
 from armcal.diagnose.coverage import fit_and_predict, intervals
 from armcal.diagnose.fit import Fit, Prepared, widened

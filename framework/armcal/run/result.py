@@ -10,8 +10,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.config_text import finite
 from armcal.base.dataset import Dataset
-from armcal.calibration.intervals import PredictionRecord
-from armcal.calibration.recorded_range import PAYLOAD
+from armcal.calibration.intervals import PAYLOAD, PredictionRecord
 from armcal.config.system import System
 from armcal.diagnose.coverage import IntervalResult, intervals
 from armcal.diagnose.fit import Fit, RecordErrors

@@ -13,9 +13,15 @@ from armcal.base.dataset import Dataset
 from armcal.base.domains import Interval
 from armcal.base.parameters import Parameters
 from armcal.calibration.calibration import Calibration
-from armcal.calibration.calibration_file import UNMOVED_SD, InformationRecord, ParameterRecord, identity_of, sealed
+from armcal.calibration.calibration_file import (
+    UNMOVED_SD,
+    InformationRecord,
+    ParameterRecord,
+    identity_of,
+    sealed,
+    under_load,
+)
 from armcal.calibration.intervals import covariance_rows
-from armcal.calibration.physics import under_load
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, Location
 from armcal.estimate.estimator import interval

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 import pytest
-from armcal.calibration.joint_zeros import Zero
+from armcal.calibration.calibration import Zero
 from armcal.errors import DataError, InputError
 from armcal_lerobot.motor_files import Motor, read_motors, rezeroed, teeth_of, zero_shift_deg
 
