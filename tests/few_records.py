@@ -17,8 +17,8 @@ from armcal.calibration.calibration import Calibration
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.outputs import reserved, write
 from armcal.run.pipeline import calibrate
+from armcal.run.result import reserved, write
 from armcal_online.sources import Incoming
 from armcal_online.tracking.recalibrator import Recalibrator
 from armcal_online.tracking.settings import RecalibrateSettings

@@ -14,7 +14,8 @@ from armcal.estimate.estimator import CHECK_THE_DATA, Estimate
 from armcal.io.parallel import Executor
 from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
-from armcal.run import experiment, outputs
+from armcal.run import experiment
+from armcal.run import result as results
 from armcal.run.pipeline import calibrate
 from armcal.run.result import RunResult
 
@@ -52,7 +53,7 @@ class Run:
 
         Where nothing measured is a length they are ``metrics["error_mrad"]``.
         """
-        return outputs.metrics(self.result)
+        return results.metrics(self.result)
 
     @property
     def calibration(self) -> Calibration:
@@ -66,8 +67,8 @@ class Run:
                 f"{self.estimate.verdict.name} did not converge ({self.estimate.verdict.status}).",
                 hint=CHECK_THE_DATA,
             )
-        text = sealed(outputs.calibration_content(self.result, self.experiment))
-        return outputs.read_back(text, self.experiment.registry)
+        text = sealed(results.calibration_content(self.result, self.experiment))
+        return results.read_back(text, self.experiment.registry)
 
     def write(self, folder: str | Path, accept: bool = False) -> Path:
         """Write what ``armcal run`` writes: calibration.yaml, report.html, metrics.json and the rest.
@@ -78,8 +79,8 @@ class Run:
             InputError: the folder holds other things, or cannot be written.
         """
         document = run_document(self.result, plugin_sections(self.result, self.experiment.registry)[0])
-        with outputs.reserved(Path(folder)) as held:
-            outputs.write(held, self.result, self.experiment, page(document), accept)
+        with results.reserved(Path(folder)) as held:
+            results.write(held, self.result, self.experiment, page(document), accept)
         return Path(folder)
 
 

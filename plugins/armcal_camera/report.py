@@ -8,7 +8,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.report.document import Figure, Marks, Panel, Part, ReportSection, Table
 from armcal.report.numbers import significant
-from armcal.report.plot import nice_step
+from armcal.report.page import nice_step
 from armcal.run.result import RunResult
 
 if TYPE_CHECKING:  # importing it takes 0.1 s, which a run without a camera must not wait for

@@ -14,7 +14,7 @@ from armcal.diagnose.verdict import shift_findings
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
-from armcal.report.run_tables import parameters_table, principal_table
+from armcal.report.run_document import parameters_table, principal_table
 from armcal.run.experiment import Experiment
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

@@ -14,8 +14,8 @@ from armcal.estimate.identifiability import candidates, freeing
 from armcal.measure.csv_writer import write_csv
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.run.fixed_parameters import FixedParameters, fixed_parameters
 from armcal.run.pipeline import Stopwatch, assemble
+from armcal.run.study import FixedParameters, fixed_parameters
 from armcal.scaffold.robot import read_rows, robot_of_rows
 from armcal.scaffold.robot_files import SIMULATED, write_robot
 from click.testing import CliRunner

@@ -201,5 +201,5 @@ def test_spaces_about_a_label_mean_nothing(data, tmp_path):
     )
     validation = {"train_groups": ["front", "back"]}
     result = calibrate(Experiment.load(written(tmp_path, spaced, validation=validation)))
-    assert [each.name for each in result.groups] == ["back", "front", "shelf"]
+    assert list(result.groups) == ["back", "front", "shelf"]
     assert ball(("left",)).group_labels == ("position", "socket")

@@ -11,7 +11,7 @@ import pytest
 from armcal.arm.assembly import only_arm
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
-from armcal.run.iso_plan import CORNERS, POINTS
+from armcal.run.plan import CORNERS, POINTS
 from click.testing import CliRunner, Result
 from scipy.spatial.transform import Rotation
 

@@ -14,7 +14,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.report.page import page as page_of
 from armcal.report.run_document import run_document
-from armcal.run import outputs
+from armcal.run import result as results
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
@@ -169,7 +169,7 @@ def test_components_reach_every_output(repository, tmp_path):
 def test_noise_for_each_axis_is_one_number_thrice_or_a_list(repository):
     def judged(*overrides):
         config = repository / "configs" / "lrm_arm" / "demo.yaml"
-        return outputs.metrics(calibrate(Experiment.load(config, ["validation.folds=0", *overrides])))
+        return results.metrics(calibrate(Experiment.load(config, ["validation.folds=0", *overrides])))
 
     one = judged()
     same = judged("measurements.tracker.noise_mm=[0.5, 0.5, 0.5]")
@@ -201,10 +201,10 @@ def test_bad_settings_are_refused_at_their_place(repository, tmp_path, override,
 @pytest.mark.slow
 def test_the_report_escapes_what_a_suspicious_record_is_called(rejected):
     result = rejected[0]
-    odd = replace(result.noise.suspicious[0], record_id="<b>x</b>")
-    page = page_of(run_document(replace(result, noise=replace(result.noise, suspicious=(odd,)))))
+    odd = replace(result.suspicious[0], record_id="<b>x</b>")
+    page = page_of(run_document(replace(result, suspicious=(odd,))))
     assert "&lt;b&gt;x&lt;/b&gt;" in page and "<b>x</b>" not in page
-    assert json.dumps(outputs.metrics(result))
+    assert json.dumps(results.metrics(result))
 
 
 @pytest.mark.slow
@@ -227,7 +227,7 @@ def test_the_real_arm_is_noisier_in_its_joints_than_its_tracker(repository, shar
     """The tracker is good to 0.5 mm along x and z; the servos step by 0.53 deg."""
     config, data = repository / "configs" / "lrm_arm" / "option1.yaml", shared_data / "lrm_arm" / "poses.csv"
     given = ["noise.estimate=true", "noise.axes=apart", "validation.folds=0"]
-    found = calibrate(Experiment.load(config, given, data)).noise.components
+    found = calibrate(Experiment.load(config, given, data)).fit.fitted.components
     assert found is not None and found.share("joint") > 0.8
     sd = {c.name: c.sd for c in found.components}
     assert sd["tracker.x"] < 1 and sd["tracker.z"] < 1

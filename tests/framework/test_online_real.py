@@ -14,8 +14,8 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.estimate.online import Gaussian
 from armcal.run.experiment import Experiment
-from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
+from armcal.run.result import calibration_content
 from armcal_online.sources import Incoming
 from armcal_online.tracking.belief import Belief
 from armcal_online.tracking.recalibrator import Recalibrator

@@ -184,7 +184,7 @@ def test_a_second_run_into_one_folder_is_refused_while_the_first_lasts(tmp_path:
 
 
 def folders_of_a_run() -> tuple[str, ...]:
-    from armcal.run.outputs import FILES
+    from armcal.run.result import FILES
 
     return FILES
 

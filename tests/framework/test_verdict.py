@@ -17,7 +17,7 @@ from armcal.estimate.identifiability import POOR_CONDITION, analyse
 from armcal.estimate.robust import limit_of, median_norm
 from armcal.planning.suggestion import suggest
 from armcal.problem.problem import Problem
-from armcal.run import outputs
+from armcal.run import result as results
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
@@ -31,7 +31,7 @@ COMPLIANCES = [f"arm.spring.k{i}" for i in range(7)]
 def judged(*settings: str, data: Path = CONFIGS / "demo.csv") -> dict:
     """The numbers of a run without its files, judged by the records that were held out."""
     experiment = Experiment.load(DEMO, [*settings, "validation.folds=0", "evaluator=interpreted"], data)
-    return outputs.metrics(calibrate(experiment))
+    return results.metrics(calibrate(experiment))
 
 
 def sentences(*settings: str, data: Path = CONFIGS / "demo.csv") -> str:

@@ -372,11 +372,7 @@ class Calibration:
 
 
 def arm_named(calibration: Calibration, arm: str | None) -> str:
-    """The arm of this name, or the only one if there is no name.
-
-    Raises:
-        ConfigError: no such arm, or several and no name.
-    """
+    """The arm of this name, or the only one if there is no name."""
     arms = calibration.system.arms
     if arm is None and len(arms) > 1:
         raise ConfigError(f"the calibration has {len(arms)} arms, {', '.join(arms)}.", hint="Choose: --arm NAME.")
@@ -430,11 +426,7 @@ def accept(path: Path, day: str, registry: PluginRegistry) -> tuple[Calibration 
 
 
 def _check_values(record: CalibrationFile, source: ConfigSource) -> None:
-    """Each value lies in its interval, and a fixed one is its nominal value.
-
-    Raises:
-        ConfigError: one does not.
-    """
+    """Each value lies in its interval, and a fixed one is its nominal value."""
     for index, entry in enumerate(record.parameters):
         where = source.where(("parameters", index, "value"))
         low, high = (-np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper)
@@ -468,10 +460,6 @@ def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dic
 
     A zero is what a joint effect states as one (``JointEffect.zeros``), as it stands, and what a model's own ``theta``
     or ``offset`` differs from its drawing.
-
-    Raises:
-        ConfigError: the calibration is refused.
-        InputError: it has no zero, or several arms and none was named.
     """
     loaded, where = Calibration.load(path, registry), Location(str(path))
     arms = loaded.system.arms

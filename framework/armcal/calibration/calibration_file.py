@@ -210,9 +210,6 @@ def read_record(path: str | Path, changed: bool = False, content: bytes | None =
     """A calibration's content, and whether it is as armcal wrote it; if it must be, ``changed`` is false.
 
     ``content`` is what the file holds, where it need not be there.
-
-    Raises:
-        ConfigError: it cannot be read, is not a calibration of this schema, or was changed since it was written.
     """
     states: list[Literal["whole", "broken", "absent"]] = []
 
@@ -287,11 +284,7 @@ def readable(system: System) -> Mapping[str, Measurement]:
 
 
 def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[dict[str, Array], Array]:
-    """What instruments would read (SI, N each by channel) and base_T_tool (arms x N x 4 x 4), in elastic equilibrium.
-
-    Raises:
-        NotConvergedError: a record has no equilibrium.
-    """
+    """Instruments' readings (SI, N each by channel) and base_T_tool (arms x N x 4 x 4), in elastic equilibrium."""
     fixed = parameters.with_free(())
     measurements, names = dict(readable(system)), tuple(system.arms)
     if tuple(next((m.arms for m in measurements.values()), ())) != names:  # the first shows where tools are
@@ -383,11 +376,7 @@ def check_poses(system: System, dataset: Dataset, candidates: Indices) -> Datase
 
 
 def check_record(system: System, parameters: Parameters, commands: Dataset, stated: PlusMinus | None) -> CheckRecord:
-    """Predictions with the parameters at their nominal values, and what is stated about their accuracy.
-
-    Raises:
-        NotConvergedError: a record has no equilibrium.
-    """
+    """Predictions with the parameters at their nominal values, and what is stated about their accuracy."""
     channels, tools = predict(system, parameters, commands)
     widths = {} if stated is None else {n: float(np.min(w)) for n, w in stated.half_widths.items()}
     radii = [] if stated is None else [float(np.min(radius)) for radius in stated.radii.values()]
@@ -419,10 +408,6 @@ def movement(system: System, parameters: Parameters, kept: CheckRecord) -> tuple
 
     The farthest that a tool moved (m), or a point 1 m from it by its rotation; the largest movement of a channel or
     tool, in units of what is stated for it; and the name of that channel or arm.
-
-    Raises:
-        NotConvergedError: a record has no equilibrium now.
-        ValueError: what is kept does not fit the system.
     """
     channels, tools = predict(system, parameters.with_nominal(np.array(kept.values)), kept.commands)
     shares, tool_m = {}, 0.0

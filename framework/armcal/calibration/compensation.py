@@ -188,9 +188,6 @@ def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> 
 
     ``stated`` take the place of the model's. A servo's pulse table is known between its ends only, so a joint with one
     stays between them too.
-
-    Raises:
-        ValueError: limits of a joint that is not there, or in falling order.
     """
     known = joint_limits(expression.arm.nominal_chain, stated)
     limits = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])

@@ -66,12 +66,7 @@ class Difference:
 
 
 def load_source(path: str | Path, arm: str | None, registry: PluginRegistry) -> ConvertSource:
-    """The chain of an arm of a configuration or a calibration.
-
-    Raises:
-        ConfigError: it is refused, has no such arm, or several and none was named.
-        PluginError: its model is not known.
-    """
+    """The chain of an arm of a configuration or a calibration."""
     source = load_config(path)
     name = _named(source, arm)
     if "armcal_calibration" in source.data:
@@ -90,12 +85,7 @@ def nominal_values(model: ArmModel) -> dict[str, Array]:
 
 
 def reload(text: str, registry: PluginRegistry) -> Chain:
-    """The nominal chain of a section ``model:``, read like that of any configuration.
-
-    Raises:
-        ConfigError: it is refused.
-        PluginError: no plugin offers its type.
-    """
+    """The nominal chain of a section ``model:``, read like that of any configuration."""
     content = ("arms:\n  arm:\n" + textwrap.indent(text, "    ")).encode()
     source = load_config("converted.yaml", content=content)
     model = build_component(source, registry, "model", ("arms", "arm", "model"))[0]
@@ -153,11 +143,7 @@ UNKNOWN = "0"  # What a URDF has to state and nobody knows: effort, velocity, an
 
 
 def poe_section(chain: RigidChain) -> dict[str, Any]:
-    """Every axis by its direction and a point, and the tool at zero angles.
-
-    Raises:
-        ProblemError: a joint follows another, or has pitch or scale.
-    """
+    """Every axis by its direction and a point, and the tool at zero angles."""
     require_independent(chain, "poe")
     require_plain_axes(chain, "poe")
     joints = [
@@ -187,9 +173,6 @@ def urdf_text(chain: RigidChain, name: str) -> str:
     """A URDF without shapes and masses, one link a joint. Lengths in m, angles in rad.
 
     Links are ``base_link``, ``link1``, ..., ``tip_link``; joints have their names.
-
-    Raises:
-        ProblemError: a joint has pitch or scale.
     """
     require_plain_axes(chain, "a URDF")
     lines, parent, here = [f"<robot name={_attribute(name)}>", f'  <link name="{BASE}"/>'], BASE, np.eye(4)
@@ -270,11 +253,7 @@ class Link:
 
 
 def mdh_section(chain: RigidChain, convention: Convention) -> dict[str, Any]:
-    """Rows, and steps before and after them.
-
-    Raises:
-        ProblemError: a joint follows another, or has pitch or scale.
-    """
+    """Rows, and steps before and after them."""
     require_independent(chain, "mdh")
     require_plain_axes(chain, "mdh")
     frame = _frame_on(chain.joints[0].base_T_joint, chain.joints[0].direction)

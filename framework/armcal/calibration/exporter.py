@@ -136,11 +136,7 @@ def changed_numbers(request: ExportRequest) -> int:
 
 
 def request_of(calibration: Calibration, arm: str | None, out: str = "") -> ExportRequest:
-    """What a calibration says of one arm, of its only one if no name is given; ``out`` names the file to be written.
-
-    Raises:
-        ConfigError: no such arm, or several and no name.
-    """
+    """What a calibration says of one arm, of its only one if no name is given; ``out`` names the file to be written."""
     arms, name = calibration.system.arms, arm_named(calibration, arm)
     values = {block.name: np.array(block.nominal) for block in calibration.parameters.blocks}
     own = {block.name for block in arms[name].parameters()}
@@ -208,9 +204,6 @@ def effects_reach(
 
     Under the configured gravity and load, no load where none is configured. None where an elastic arm does not
     settle in all poses.
-
-    Raises:
-        DataError: the arm cannot be predicted.
     """
     commands = random_commands(request.arm)
     statics = calibration.system.statics

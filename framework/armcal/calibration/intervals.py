@@ -123,9 +123,6 @@ class Uncertainty:
 
         Args:
             commands: records with joint angles, load, gravity.
-
-        Raises:
-            NotConvergedError: a record has no equilibrium.
         """
         problem, commands = self._with_predictions(commands)
         parts = [self._part(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.arange(len(commands)))]

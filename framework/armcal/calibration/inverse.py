@@ -411,11 +411,7 @@ class Solver:
         return first
 
     def exactly(self, goal: Goal, manner: Manner) -> Solutions:
-        """Search by exact steps alone until it is near, or no longer comes nearer.
-
-        Raises:
-            ValueError: an array of another shape.
-        """
+        """Search by exact steps alone until it is near, or no longer comes nearer."""
         return self._search(self._exact, goal, manner, self._near)
 
     def _search(self, steps: BatchFunction, goal: Goal, manner: Manner, near: tuple[float, float, float]) -> Solutions:

@@ -249,11 +249,7 @@ class Equilibrium:
         return Standing(states, poses_of(tools.reshape(1, 4, 3, -1))[0], settled)
 
     def required(self, record: Array) -> Array:
-        """base_T_tool (N x 4 x 4) for records that must settle.
-
-        Raises:
-            NotConvergedError: one has no equilibrium.
-        """
+        """base_T_tool (N x 4 x 4) for records that must settle."""
         tools = self._evaluator(np.zeros(0), record, np.zeros((self._size, record.shape[1])))
         return np.asarray(poses_of(tools.reshape(1, 4, 3, -1))[0])
 
@@ -317,11 +313,7 @@ def measured_point(system: System, name: str, parameters: Parameters) -> Measure
 
 
 def tool_point(point: Point, system: System, name: str, parameters: Parameters) -> Transform | None:
-    """Where the point that arrives is on the tool of an arm; None for the tool's frame itself.
-
-    Raises:
-        ConfigError: there is no such point, or no measurement reads it.
-    """
+    """Where the point that arrives is on the tool of an arm; None for the tool's frame itself."""
     if point not in get_args(Point):
         raise ConfigError(
             f"found the point {point!r}.", hint=f"Expected one of {', '.join(map(repr, get_args(Point)))}."

@@ -40,8 +40,8 @@ from armcal.estimate.start import Start, pose_words
 from armcal.planning.candidates import observability
 from armcal.problem.variants import factor_at_zero
 from armcal.run.experiment import Experiment
-from armcal.run.fixed_parameters import FixedParameters, fixed_parameters
 from armcal.run.pipeline import Stopwatch, assemble
+from armcal.run.study import FixedParameters, fixed_parameters
 
 _MM = 1000.0
 

@@ -26,8 +26,7 @@ from armcal.measure.measurement import borrowed_names
 from armcal.problem.problem import Problem
 from armcal.report.document import Document, Section, Table
 from armcal.run.experiment import Experiment, PlanSettings
-from armcal.run.iso_plan import NAMES, POINTS, make_iso_plan
-from armcal.run.plan import PlanResult, make_plan
+from armcal.run.plan import NAMES, POINTS, PlanResult, make_iso_plan, make_plan
 from armcal.run.plan_poses import counts_text, read_poses, stated_beyond
 
 _SHOWN = 8

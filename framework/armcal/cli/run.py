@@ -15,7 +15,7 @@ from armcal.report.numbers import plural
 from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
 from armcal.report.study_document import study_document
-from armcal.run import outputs
+from armcal.run import result as results
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate
 from armcal.run.result import RunResult
@@ -44,7 +44,7 @@ def run(
     """Calibrate the arm that CONFIG describes: load, check, fit, validate, report."""
     watch = Stopwatch()
     folder = out or Path("runs") / config.stem
-    kept = click.get_current_context().with_resource(outputs.reserved(folder))
+    kept = click.get_current_context().with_resource(results.reserved(folder))
     registry = console.registry()
     experiment = Experiment.load(config, overrides, data, registry)
     with console.progress() as progress:
@@ -57,7 +57,7 @@ def run(
     result.seconds["total"] = watch.total()
     sections, faults = plugin_sections(result, registry)
     document = run_document(result, sections)
-    outputs.write(kept, result, experiment, page(document), accept)
+    results.write(kept, result, experiment, page(document), accept)
     converged = result.estimate.verdict.converged
     faults += registry.notify("armcal_run_ended", name=result.name, folder=str(folder), converged=converged)
     for text in faults:
@@ -81,7 +81,7 @@ def _end(result: RunResult, folder: Path, accept: bool) -> None:
         )
         sys.exit(EXIT_NOT_CONVERGED)
     if result.verdict.bad and not accept:
-        name = outputs.calibration_name(result, accept)
+        name = results.calibration_name(result, accept)
         say(
             f"armcal: {result.verdict.bad[0].text} The calibration is {folder / name}, which no command loads. "
             "Correct the data or the configuration; or, if you know better, run again with --accept.",

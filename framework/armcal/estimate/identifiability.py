@@ -696,9 +696,6 @@ def require_solvable(problem: Problem, start: Array) -> tuple[str, ...]:
 
     Returns:
         warnings: what is left to priors because the records are too few, or see no scale.
-
-    Raises:
-        ProblemError: fewer equations than parameters, or undetermined combinations, without priors on them.
     """
     parameters = problem.parameters
     count = problem.equations()

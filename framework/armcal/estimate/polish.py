@@ -191,9 +191,6 @@ def mislabelled(problem: Problem, dataset: Dataset) -> list[str]:
     """Warnings of records that the arm, as it starts, has at the place of another group than they name.
 
     Places are those of the middling record of each group; only groups that are places have them.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at the nominal values.
     """
     warnings, plan = [], problem.blueprint
     starts = problem.nuisance_starts(problem.parameters.nominal()) if problem.parameters.nuisances else ()

@@ -73,9 +73,6 @@ def measured_with_noise(
         exact: what every instrument would read without noise, by channel.
         random: where noise comes from.
         length_noise: of all residuals that are lengths, in place of the declared one (m).
-
-    Raises:
-        ProblemError: the residual of a measurement depends on something else than its readings.
     """
     fixed, read = request.parameters.with_free(()), with_channels(commands, exact)
     parts = (request.arms, request.measurements, fixed, request.environment, read)
@@ -138,11 +135,7 @@ def with_outliers(
 
 
 def at_truth(request: SimulationRequest, truth: Path) -> SimulationRequest:
-    """The request at the parameter values of a file.
-
-    Raises:
-        ConfigError: the file names unknown parameters.
-    """
+    """The request at the parameter values of a file."""
     source = load_config(truth)
     return replace(request, parameters=with_values(request.parameters, source.data, source, ()))
 

@@ -334,9 +334,6 @@ def with_proposals(start: Start, dataset: Dataset) -> Start:
     """The start with what measurements propose, where it is much nearer than the configuration.
 
     A parameter with a prior keeps its nominal value, and starts where it was proposed.
-
-    Raises:
-        ProblemError: the records leave free parameters open that nothing else holds.
     """
     measurements = [start.problem.blueprint.measurements[kernel.factor.name] for kernel in start.problem.kernels]
     lenders_first = sorted(enumerate(measurements), key=lambda numbered: bool(borrowed_names(numbered[1])))

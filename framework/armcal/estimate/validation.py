@@ -154,11 +154,7 @@ def _poses(count: int, poses: Indices | None) -> tuple[Indices, int]:
 
 
 def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
-    """Records with these ids train, the others judge.
-
-    Raises:
-        ProblemError: an id is not among the records, or none is left to train on.
-    """
+    """Records with these ids train, the others judge."""
     training = set(train_ids)
     missing = sorted(training - set(ids))
     if missing:
@@ -171,11 +167,7 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
 
 
 def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
-    """Records with one of these labels train, the others judge.
-
-    Raises:
-        ProblemError: no record has one of the labels.
-    """
+    """Records with one of these labels train, the others judge."""
     missing = sorted(set(train) - set(labels))
     if missing:
         raise ProblemError(

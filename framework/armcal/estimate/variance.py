@@ -221,9 +221,6 @@ def estimate_components(
     """Components at a fit, those of instruments alone unless ``of_joints``.
 
     ``records`` carry the declared noise, and weight 0 where they are left out.
-
-    Raises:
-        ProblemError: there are not more equations than parameters and components, or parameters drift.
     """
     problem = with_few_points(problem)
     sources = [s for s in _sources(problem, values, axes) if of_joints or s.kind == "instrument"]

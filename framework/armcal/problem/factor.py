@@ -351,11 +351,7 @@ def _arm_states(
 
 
 def _checked_outputs(measurement: Measurement, outputs: Any) -> dict[str, Expression]:
-    """The outputs of a measurement, each an expression (1 x 1), by local names of its channels.
-
-    Raises:
-        PluginError: they are none.
-    """
+    """The outputs of a measurement, each an expression (1 x 1), by local names of its channels."""
     channels = [channel.name for channel in measurement.channels()]
     expected = f"the expression of each channel by name: {', '.join(channels)}"
     with expecting(measurement.outputs, outputs, expected):
@@ -365,12 +361,7 @@ def _checked_outputs(measurement: Measurement, outputs: Any) -> dict[str, Expres
 
 
 def _checked_residual(name: str, measurement: Measurement, residual: Expression) -> Expression:
-    """The residual of a measurement whose noise, dimensions and noise columns are those of its entries.
-
-    Raises:
-        PluginError: the residual is no column, or noise is none.
-        ProblemError: with what differs.
-    """
+    """The residual of a measurement whose noise, dimensions and noise columns are those of its entries."""
     residual, noise = column(measurement.residual, residual, None, "a column of m or rad"), measurement.noise()
     expected = "a sequence of standard deviations above zero, one a residual entry"
     with expecting(measurement.noise, noise, expected):

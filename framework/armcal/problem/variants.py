@@ -170,11 +170,7 @@ def reading_slopes(problem: Problem, values: Array) -> tuple[Array | None, ...]:
 
 
 def disturbed(problem: Problem, values: Array, noise: Sequence[Array]) -> Problem:
-    """With readings whose residuals differ by ``noise`` (n_r x N a factor) from those that the records have.
-
-    Raises:
-        ProblemError: the residual of a measurement depends on something else than its readings.
-    """
+    """With readings whose residuals differ by ``noise`` (n_r x N a factor) from those that the records have."""
     before, moved, missing = problem.residuals(values), problem, list(noise)
     for _ in range(_STEPS):
         parts = zip(problem.kernels, moved.records, reading_slopes(moved, values), missing, strict=True)
@@ -423,11 +419,7 @@ class Chain:
 
 
 def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
-    """The places of the records of a recording; None where nothing drifts.
-
-    Raises:
-        DataError: the records do not say their order, or time, or these contradict one another.
-    """
+    """The places of the records of a recording; None where nothing drifts."""
     drifting = _drifting(problem)
     if not drifting:
         return None
@@ -464,9 +456,6 @@ def with_drift(
     """The problem of a dataset with its records correlated as drifting parameters demand, by slopes at ``values``.
 
     ``along`` is the chain of a recording that has more records than these.
-
-    Raises:
-        DataError: the records do not say their order, or time, or these contradict one another.
     """
     along = along or chain(problem, dataset)
     if along is None:

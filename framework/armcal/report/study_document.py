@@ -6,7 +6,7 @@ import numpy as np
 
 from armcal.report.document import Code, Document, Figure, Marks, Panel, Part, Section, Table
 from armcal.report.numbers import NONE, common_decimals, count, fixed, plural, significant
-from armcal.report.run_tables import provenance_facts
+from armcal.report.run_document import provenance_facts
 from armcal.run.study import Cell, StudyResult, VariantResult
 
 _SAME_MM = 1e-6

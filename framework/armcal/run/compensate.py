@@ -53,9 +53,6 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
     Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``; for a
     rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y, then z).
     Load, gravity, surroundings and approach stand as in measured data.
-
-    Raises:
-        DataError: the file cannot be read, or a rotation is given in part, or twice, or is none.
     """
     dataset = _read(path, expression, registry)
     if not len(dataset):
@@ -80,11 +77,7 @@ def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistr
 
 
 def check_units(path: Path, targets: Targets, reach: Reach) -> None:
-    """Positions ten times farther out than the arm reaches, or a hundredth of that: a unit is wrong.
-
-    Raises:
-        DataError: they are so.
-    """
+    """Positions ten times farther out than the arm reaches, or a hundredth of that: a unit is wrong."""
     away = float(np.median(np.linalg.norm(targets.positions, axis=1)))
     if np.isfinite(reach.farthest) and not reach.farthest / _NEARER < away < _FARTHER * reach.farthest:
         raise DataError(
@@ -194,11 +187,7 @@ class Bench:
         registry: PluginRegistry,
         point: Point = "tool",
     ) -> Self:
-        """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan.
-
-        Raises:
-            ConfigError: no such arm, or several and no name; or the configuration plans for another arm.
-        """
+        """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan."""
         name = arm_named(calibration, arm)
         joints = tuple(calibration.system.arms[name].commanded)
         space = workspace_of(within, joints, registry) if within else Workspace()
@@ -212,22 +201,14 @@ class Bench:
         return self.point == "target" or self.target is None or not self.target.fitted
 
     def read(self, path: Path, registry: PluginRegistry) -> tuple[Targets, Dataset]:
-        """Targets from a CSV, see ``read_targets``.
-
-        Raises:
-            DataError: it cannot be read, or the arm is elastic and nothing states what hangs on the tool.
-        """
+        """Targets from a CSV, see ``read_targets``."""
         conditions = self.calibration.system.arms[self.arm].conditions
         targets, dataset = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
         self.calibration.require_payload(dataset.has("payload"), str(path))
         return targets, dataset
 
     def compensator(self, targets: Targets | None = None) -> Compensator:
-        """What finds commands, for targets that state such surroundings.
-
-        Raises:
-            ConfigError: the limits leave a joint no room, or no measurement reads the target that shall arrive.
-        """
+        """What finds commands, for targets that state such surroundings."""
         conditions = () if targets is None else tuple(targets.conditions)
         choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
         try:
@@ -244,11 +225,7 @@ class Bench:
 
 
 def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: Commands) -> Assessed:
-    """What is known about commands that were found.
-
-    Raises:
-        NotConvergedError: a command has no elastic equilibrium.
-    """
+    """What is known about commands that were found."""
     nominal = bench.nominal()
     thought = nominal.solve(replace(targets, conditions={}), commands.joint_angles)
     reached = compensator.stand(thought.joint_angles, targets, commands.approach)
@@ -315,9 +292,6 @@ def write_commands(
     """Write commands beside the targets' own ids, angles in ``deg`` or ``rad``; or what a nominal controller is sent.
 
     Loads and surroundings are written where the targets state them, approaches where they are known.
-
-    Raises:
-        DataError: the file cannot be written.
     """
     arm, name = compensator.expression.arm, compensator.expression.name
     commands = commanded(compensator, targets, assessed.commands).channels

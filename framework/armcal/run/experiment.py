@@ -87,11 +87,7 @@ class ClearanceSettings(Settings):
 
 
 def clearance_check(settings: ClearanceSettings, arms: Mapping[str, Arm], source: ConfigSource) -> ClearanceCheck:
-    """The check that the settings describe.
-
-    Raises:
-        ConfigError: a frame or part is not known, or a rule is about no pair.
-    """
+    """The check that the settings describe."""
     arm = only_arm(arms, "clearance is checked for a single arm", "Leave the clearance out.", source.where(_AT))
     frames = joints_of_frames(arm)
     parts = {

@@ -1,6 +1,6 @@
 """A run: load, check, align, fit, validate, judge; each stage is a function of this file.
 
-``armcal.run.outputs`` writes what it gives.
+``armcal.run.result`` writes what it gives.
 """
 
 import time
@@ -32,7 +32,7 @@ from armcal.problem.problem import Problem, require_numbers
 from armcal.problem.variants import moved_by, with_drift, with_joint_noise
 from armcal.run.experiment import Experiment
 from armcal.run.pose_residual import ResidualOutcome, layer_of, learned_residual, unlearned
-from armcal.run.result import RunResult, SuspiciousRecord, noise_result, run_groups
+from armcal.run.result import RunResult, SuspiciousRecord, noise_content, run_groups, suspicious_records
 
 _MM = 1000.0
 _FAR_OFF = "the model's nominal values are far off: give better ones, or "
@@ -71,7 +71,7 @@ def calibrate(
     executor: Executor | None = None,
     accept: bool = False,
 ) -> RunResult:
-    """Calibrate (see ``outputs.write``), starts and folds by ``executor``; InputError if refused (see ``assemble``)."""
+    """Calibrate (see ``result.write``), starts and folds by ``executor``; InputError if refused (see ``assemble``)."""
     watch, registry = watch or Stopwatch(), experiment.registry
     ready = prepare(experiment, watch, accept, progress)
     faults = list(registry.notify("armcal_run_started", name=experiment.name, records=len(ready.dataset)))
@@ -83,7 +83,7 @@ def calibrate(
     learned, outcome = with_pose_residual(context, plain)
     resampled = uncertainty(context, plain)
     result = judged(context, validated(context, learned), outcome)
-    faults += _notify_rejected(registry, result.noise.set_aside)
+    faults += _notify_rejected(registry, result.rejected)
     warnings = (*result.warnings, *dict.fromkeys(faults))
     return replace(result, command=command, warnings=warnings, bootstrap=resampled)
 
@@ -188,11 +188,7 @@ def _checked(
 
 
 def require_loads(experiment: Experiment, dataset: Dataset) -> None:
-    """Free springs need something that loads them: a link's mass, a payload, a force or a torque.
-
-    Raises:
-        ConfigError: nothing does.
-    """
+    """Free springs need something that loads them: a link's mass, a payload, a force or a torque."""
     statics, channels = experiment.system.statics, LOAD_CHANNELS[3:]
     stated = statics.payload or any((*statics.force, *statics.torque))
     if stated or any(dataset.has(channel) and dataset.column(channel).any() for channel in channels):
@@ -295,6 +291,7 @@ def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> Ru
         context.progress("judging", 0.0)
         verdict = verdict_of(own, experiment.registry)
         context.progress("judging", 1.0)
+    suspicious = suspicious_records(own)
     text = f"{failed} of {len(own.ready.folds)} folds did not converge; their records are not cross-validated."
     return RunResult(
         name=experiment.name,
@@ -304,7 +301,8 @@ def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> Ru
         warnings=(*own.ready.warnings, *own.fitted.warnings, *((text,) if failed else ())),
         seconds=context.watch.seconds,
         provenance=replace(experiment, system=own.system).provenance(own.dataset),
-        noise=noise_result(own),
+        noise=noise_content(own, suspicious),
+        suspicious=suspicious,
         prediction=_prediction(experiment, own, outcome),
         groups=run_groups(experiment, own),
         pose_residual=outcome,

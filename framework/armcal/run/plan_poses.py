@@ -47,11 +47,7 @@ class JointSpace:
     def by_joint(
         self, turning: Mapping[str, Sequence[float]], sliding: Mapping[str, Sequence[float]], keys: tuple[str, str]
     ) -> dict[str, Array]:
-        """What is given of joints, by name.
-
-        Raises:
-            ConfigError: a name is not a joint's, or not one of that kind.
-        """
+        """What is given of joints, by name."""
         dimensions = dict(zip(self.names, self.dimensions, strict=True))
         stated = by_dimension(dimensions, turning, sliding, (f"plan.{keys[0]}", f"plan.{keys[1]}"))
         return {name: np.array(values) for name, values in stated.items()}
@@ -109,13 +105,7 @@ def clearance_of(experiment: Experiment) -> Allowed | None:
 def pool_of(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: Allowed | None
 ) -> Pool:
-    """Every candidate that lies within limits and keeps its clearance.
-
-    Raises:
-        ConfigError: levels or limits are missing or name no joint.
-        DataError: a list is refused.
-        ProblemError: nothing is left.
-    """
+    """Every candidate that lies within limits and keeps its clearance."""
     limits = space.limits(settings)
     usual = "continuous" if experiment.settings.data is None and np.isfinite(limits).all() else "recorded"
     kind = "listed" if listed is not None else settings.candidates or usual
@@ -136,12 +126,7 @@ def pool_of(
 
 
 def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
-    """Poses from a file, or from the configured data; measured values may be missing.
-
-    Raises:
-        ConfigError: neither is there.
-        DataError: refused by the reader.
-    """
+    """Poses from a file, or from the configured data; measured values may be missing."""
     source = experiment.source
     if path is not None:
         source = with_data(source, path)
@@ -237,11 +222,7 @@ class Workspace:
 
 
 def workspace_of(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Workspace:
-    """Limits and clearance of a configuration's ``plan``, for an arm with these joints.
-
-    Raises:
-        ConfigError: it has no plan, or plans for another arm.
-    """
+    """Limits and clearance of a configuration's ``plan``, for an arm with these joints."""
     experiment = Experiment.load(path, registry=registry)
     plan = experiment.settings.plan
     if plan is None:

@@ -152,11 +152,7 @@ class Layer:
 
 
 def unlearned(system: System) -> Arm | None:
-    """The arm whose pose residual is to be learned.
-
-    Raises:
-        ConfigError: there are several, or what is measured does not show where a tool is.
-    """
+    """The arm whose pose residual is to be learned."""
     arms = [arm for arm in system.arms.values() if arm.residual is not None and not arm.residual.is_learned]
     if not arms:
         return None
@@ -175,11 +171,7 @@ def unlearned(system: System) -> Arm | None:
 
 
 def layer_of(system: System, dataset: Dataset) -> Layer | None:
-    """What folds of these records need to learn; None where no pose residual is to be learned.
-
-    Raises:
-        ConfigError: see ``unlearned``.
-    """
+    """What folds of these records need to learn; None where no pose residual is to be learned."""
     arm = unlearned(system)
     if arm is None or arm.residual is None:
         return None

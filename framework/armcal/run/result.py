@@ -1,26 +1,44 @@
 """What a run knows when it ends: everything that the outputs, the report and the terminal show."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from armcal.base.arrays import Array
-from armcal.base.config_text import finite
+from armcal.base.config_text import as_json, finite
 from armcal.base.dataset import Dataset
+from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration_file import (
+    SCHEMA,
+    CalibrationFile,
+    InformationRecord,
+    check_poses,
+    dump,
+    parameter_records,
+    sealed,
+)
 from armcal.calibration.intervals import PAYLOAD, PredictionRecord
 from armcal.config.system import System
 from armcal.diagnose.coverage import IntervalResult, intervals
 from armcal.diagnose.fit import Fit, RecordErrors
-from armcal.diagnose.verdict import Verdict
+from armcal.diagnose.verdict import Verdict, evidence
+from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
-from armcal.estimate.prediction import ResidualSpread, residual_spread
+from armcal.estimate.prediction import residual_spread
 from armcal.estimate.uncertainty import Bootstrap
-from armcal.estimate.validation import ErrorSummary, Split, summarise
-from armcal.estimate.variance import VarianceComponents
+from armcal.estimate.validation import ErrorSummary, Split, in_unit, summarise
+from armcal.io import folder as folders
+from armcal.measure.csv_writer import csv_text
+from armcal.measure.reader import surroundings
+from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, group_texts
 from armcal.run.pose_residual import ResidualOutcome
@@ -47,93 +65,57 @@ class SuspiciousRecord:
     def reason(self) -> str:
         return f"{self.deviations:.1f} standard deviations from the fit (limit {self.limit:.1f})"
 
-    @property
-    def fate(self) -> str:
-        return "set aside" if self.weight == 0 else f"weight {self.weight:.2g}"
 
-
-@dataclass(frozen=True)
-class NoiseResult:
-    """How the records of a run weighed.
-
-    Attributes:
-        weights: of each record of the dataset in the fit, its least one if it has several (N; nan: not trained on).
-        scatter: of what the fit leaves unexplained, by measurement.
-    """
-
-    loss: str = "none"  # ``none``, ``huber``, ``cauchy`` or ``reject``
-    weights: Array | None = None
-    suspicious: tuple[SuspiciousRecord, ...] = ()  # the farthest first; not sought in plain least squares
-    components: VarianceComponents | None = None  # estimated variances, or None
-    rounds: int = 0  # solves beyond the first
-    scatter: Mapping[str, ResidualSpread] = field(default_factory=dict)
-
-    @property
-    def set_aside(self) -> tuple[SuspiciousRecord, ...]:
-        return tuple(record for record in self.suspicious if record.weight == 0)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For metrics.json and calibration.yaml."""
-        content: dict[str, Any] = {"loss": self.loss}
-        if self.loss != "none":
-            content["rounds"] = self.rounds
-            content["suspicious_records"] = [asdict(record) for record in self.suspicious]
-        if self.components is not None:
-            content["components"] = [finite(asdict(component)) for component in self.components.components]
-            content["inseparable"] = [list(pair) for pair in self.components.inseparable]
-            content["unseen_joints"] = list(self.components.unseen)
-        spreads = self.scatter.items()
-        content["scatter"] = {name: {**asdict(own), "covariance": own.covariance.tolist()} for name, own in spreads}
-        return content
-
-
-def noise_result(fit: Fit) -> NoiseResult:
-    fitted, dataset, train = fit.fitted, fit.dataset, fit.split.train
-    weights = np.full(len(dataset), np.nan)
-    weights[train] = np.min(np.array(fitted.weights), axis=0)
-    suspicious = []
-    for suspect in fitted.suspects:
-        i = int(train[suspect.record])
+def suspicious_records(fit: Fit) -> tuple[SuspiciousRecord, ...]:
+    """The farthest first; not sought in plain least squares."""
+    dataset, records = fit.dataset, list[SuspiciousRecord]()
+    for suspect in fit.fitted.suspects:
+        i = int(fit.split.train[suspect.record])
         row = dataset.rows[i] if dataset.rows else 0
         numbers = (suspect.distance, suspect.limit, suspect.weight, float(fit.errors.calibrated_mm[i]))
-        suspicious.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
-    scatter = residual_spread(fitted.problem, fit.estimate, fit.ready.trained)
-    return NoiseResult(fitted.loss, weights, tuple(suspicious), fitted.components, len(fitted.rounds), scatter)
+        records.append(SuspiciousRecord(row, dataset.ids[i], suspect.measurement, *numbers))
+    return tuple(records)
 
 
-@dataclass(frozen=True)
-class GroupError:
-    """How wrong the model is on the records of one group (mean, mm), before and after calibration.
+def noise_content(fit: Fit, suspicious: Sequence[SuspiciousRecord]) -> dict[str, Any]:
+    """How the records weighed, and what the fit leaves unexplained, for metrics.json and calibration.yaml."""
+    fitted, estimate = fit.fitted, fit.estimate
+    content: dict[str, Any] = {"loss": fitted.loss}
+    if fitted.loss != "none":
+        content["rounds"] = len(fitted.rounds)
+        content["suspicious_records"] = [asdict(record) for record in suspicious]
+    if fitted.components is not None:
+        content["components"] = [finite(asdict(component)) for component in fitted.components.components]
+        content["inseparable"] = [list(pair) for pair in fitted.components.inseparable]
+        content["unseen_joints"] = list(fitted.components.unseen)
+    scatter = residual_spread(fitted.problem, estimate, fit.ready.trained).items()
+    content["scatter"] = {name: {**asdict(own), "covariance": own.covariance.tolist()} for name, own in scatter}
+    return content
 
-    ``distance_error_mm`` is what is left of known distances within the group; None where none is known.
+
+def run_groups(experiment: Experiment, fit: Fit) -> dict[str, dict[str, Any]]:
+    """How wrong the model is on the records of each group (mean, mm), by name; none if nothing separates groups.
+
+    Distance errors are what is left of known distances within the group; None where none is known.
     """
-
-    name: str
-    records: int
-    trained: int
-    nominal_error_mm: float
-    error_mm: float
-    nominal_distance_error_mm: float | None
-    distance_error_mm: float | None
-
-
-def run_groups(experiment: Experiment, fit: Fit) -> tuple[GroupError, ...]:
-    """Errors of each group, sorted by name; none if nothing separates groups."""
     problem, dataset, label, errors = fit.problem, fit.dataset, experiment.label, fit.errors
     if label is None or not (label in dataset.extra or (label == PAYLOAD and dataset.has(PAYLOAD))):
-        return ()
+        return {}
     labels = np.array(group_texts(dataset, label))
     before = _distances(problem, settled(untrained(problem), problem.parameters.nominal()))
     # Distances are judged by what the records of each socket say, not by what the known distance made of them.
     after = _distances(problem, settled(untrained(problem), fit.estimate.values))
-    result = []
-    for name in sorted(set(labels.tolist()) - {""}):
-        inside = labels == name
-        nominal, calibrated = (float(np.nanmean(e[inside])) for e in (errors.nominal_mm, errors.calibrated_mm))
-        trained = int(np.sum(inside[fit.split.train]))
-        of_nominal, of_calibrated = _within(name, before), _within(name, after)
-        result.append(GroupError(name, int(inside.sum()), trained, nominal, calibrated, of_nominal, of_calibrated))
-    return tuple(result)
+    return {
+        name: {
+            "records": int(np.sum(labels == name)),
+            "trained": int(np.sum(labels[fit.split.train] == name)),
+            "nominal_error_mm": float(np.nanmean(errors.nominal_mm[labels == name])),
+            "error_mm": float(np.nanmean(errors.calibrated_mm[labels == name])),
+            "nominal_distance_error_mm": _within(name, before),
+            "distance_error_mm": _within(name, after),
+        }
+        for name in sorted(set(labels.tolist()) - {""})
+    }
 
 
 def _distances(problem: Problem, values: Array) -> list[tuple[tuple[str, str], float]]:
@@ -198,10 +180,11 @@ class RunResult:
         warnings: of config, data and problem.
         seconds: of each stage, and ``total``.
         provenance: hashes and versions.
-        noise: how the training records weighed.
+        noise: how the training records weighed, as metrics.json has it.
+        suspicious: training records beyond their limits.
         bootstrap: refits to resampled records, if they were asked for.
         prediction: what predictions need of the run beyond the values; None if it did not converge.
-        groups: errors of groups of records, where a column separates them.
+        groups: errors of groups of records by name, where a column separates them, as metrics.json has them.
         pose_residual: what became of one that was to be learned.
     """
 
@@ -212,10 +195,11 @@ class RunResult:
     warnings: tuple[str, ...]
     seconds: dict[str, float]
     provenance: dict[str, Any]
-    noise: NoiseResult = field(default_factory=NoiseResult)
+    noise: Mapping[str, Any] = field(default_factory=lambda: {"loss": "none", "scatter": {}})
+    suspicious: tuple[SuspiciousRecord, ...] = ()
     bootstrap: Bootstrap | None = None
     prediction: PredictionRecord | None = None
-    groups: tuple[GroupError, ...] = ()
+    groups: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     pose_residual: ResidualOutcome | None = None
 
     @property
@@ -250,6 +234,11 @@ class RunResult:
         return ErrorTable.of(self.errors, self.split)
 
     @property
+    def rejected(self) -> tuple[SuspiciousRecord, ...]:
+        """The suspicious records that the fit set aside."""
+        return tuple(record for record in self.suspicious if record.weight == 0)
+
+    @property
     def intervals(self) -> IntervalResult:
         """How wide prediction intervals are, and what they hold."""
         return self.fit.of(intervals)
@@ -258,3 +247,209 @@ class RunResult:
     def backend(self) -> str:
         """What evaluated the model."""
         return self.fit.problem.backend
+
+
+FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "calibration.yaml")
+"""In the order in which they are put in place: the calibration last."""
+NOT_CONVERGED_SUFFIX = ".not-converged"
+DO_NOT_USE_SUFFIX = ".do-not-use"
+UNREADABLE_SUFFIX = ".unreadable"
+_OURS = (
+    "bootstrap.csv",  # of runs by earlier versions, which made these three files
+    "log.txt",
+    "profile.json",
+    *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX, UNREADABLE_SUFFIX)),
+    *FILES,
+)
+
+
+def reserved(folder: Path) -> AbstractContextManager[folders.Reservation]:
+    """Keep a folder for one run."""
+    return folders.reserved(folder, _OURS)
+
+
+def calibration_name(result: RunResult, accepted: bool) -> str:
+    """What the calibration is called: as no command loads it if it did not converge, or is bad and not accepted."""
+    if not result.estimate.verdict.converged:
+        return f"calibration.yaml{NOT_CONVERGED_SUFFIX}"
+    return f"calibration.yaml{DO_NOT_USE_SUFFIX}" if result.verdict.bad and not accepted else "calibration.yaml"
+
+
+def write(
+    held: folders.Reservation, result: RunResult, experiment: Experiment, page: str, accepted: bool = False
+) -> None:
+    """Write all files into a reserved folder; those of an earlier run in the same place move to ``earlier/``.
+
+    Raises:
+        InputError: the folder cannot be written.
+        ArmcalError: the calibration cannot be read back: it is left as ``calibration.yaml.unreadable``.
+    """
+    texts: dict[str, str] = {}
+    fault: ArmcalError | None = None
+    texts |= {
+        "experiment.yaml": dump(experiment.source.data),
+        "residuals.csv": residuals_text(result),
+        "metrics.json": as_json(metrics(result)) + "\n",
+        "report.html": page,
+        calibration_name(result, accepted): sealed(calibration_content(result, experiment, accepted)),
+    }
+    if "calibration.yaml" in texts:
+        try:
+            read_back(texts["calibration.yaml"], experiment.registry)
+        except ArmcalError as refusal:
+            fault = refusal
+            texts[f"calibration.yaml{UNREADABLE_SUFFIX}"] = texts.pop("calibration.yaml")
+    held.place(texts)
+    if fault is not None:
+        hint = f"It was left as calibration.yaml{UNREADABLE_SUFFIX}, which nothing loads. {fault.hint}"
+        raise ArmcalError(f"the calibration cannot be read back: {fault.message}", hint=hint) from fault
+
+
+def metrics(result: RunResult) -> dict[str, Any]:
+    """The numbers of a run for other programs."""
+    estimate, known, verdict = result.estimate, result.estimate.identifiability, result.verdict
+    content = {
+        "experiment": result.name,
+        "error_mm": _errors(result),
+        **({"orientation_error_deg": result.table.turns.as_dict()} if result.table.turns else {}),
+        "groups": result.groups,
+        **({"pose_residual": result.pose_residual.as_dict()} if result.pose_residual else {}),
+        "records": {
+            "used": len(result.dataset),
+            "train": len(result.split.train),
+            "holdout": len(result.split.holdout),
+            "set_aside": len(result.dataset.set_aside),
+            "rejected": len(result.rejected),
+        },
+        "parameters": {
+            "free": len(known),
+            "rank": known.rank,
+            "determined_by": estimate.sources,
+            "at_bound": list(estimate.at_bound),
+            "undetermined": [str(combination) for combination in known.undetermined],
+            "scaled_condition": finite(float(known.condition)),
+        },
+        "noise": _noise(result),
+        "solver": asdict(estimate.verdict),
+        "verdict": {
+            "usable": not verdict.bad,
+            "grade": verdict.grade,
+            "headline": verdict.headline,
+            "findings": [asdict(finding) for finding in verdict.findings],
+            "paragraph": verdict.paragraph,
+        },
+        "structure": evidence(result.fit),
+        "prediction_intervals": result.intervals.as_dict(),
+        "bootstrap": _bootstrap_metrics(result),
+        "warnings": list(result.warnings),
+        "evaluator": result.backend,
+        "seconds": dict(result.seconds),
+        "provenance": result.provenance,
+    }
+    return dict(in_unit(content, result.errors.unit))
+
+
+def _errors(result: RunResult) -> dict[str, Any]:
+    """The table, and of training and judging groups the mean of their means: a group of few records counts as much."""
+    table, groups = result.table.as_dict(), result.groups.values()
+    for key, trained in (("train", True), ("holdout", False)):
+        if own := [group for group in groups if bool(group["trained"]) == trained]:
+            table["nominal"][key]["mean_of_groups"] = float(np.mean([group["nominal_error_mm"] for group in own]))
+            table["calibrated"][key]["mean_of_groups"] = float(np.mean([group["error_mm"] for group in own]))
+            known = [e for group in own if (e := group["distance_error_mm"]) is not None]
+            table["calibrated"][key]["distance_mean_of_groups"] = float(np.mean(known)) if known else None
+    return table
+
+
+def calibration_content(result: RunResult, experiment: Experiment, accepted: bool = False) -> dict[str, Any]:
+    """The content of calibration.yaml; nothing loads one whose verdict is bad, unless it was ``accepted``."""
+    estimate, provenance, unit = result.estimate, result.provenance, result.errors.unit
+    quality: dict[str, Any] = {f"quality_{unit}": result.table.as_dict()}
+    information = InformationRecord(
+        increments=estimate.parameters.coordinate_names,
+        square_root=tuple(tuple(float(x) for x in row) for row in estimate.square_root_information),
+    )
+    record = CalibrationFile(
+        armcal_calibration=SCHEMA,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        experiment=result.name,
+        converged=estimate.verdict.converged,
+        software=dict(provenance["versions"]),
+        identity={"arm": provenance["arm_sha256"], "data": provenance["data_sha256"], "source": provenance["data"]},
+        environment_columns=tuple(filter(result.dataset.has, surroundings(result.system.arms))),
+        noise=in_unit(_noise(result), unit),
+        **quality,
+        verdict={
+            "headline": result.verdict.headline,
+            "usable": not result.verdict.bad,
+            "accepted": accepted,
+            "findings": [f.text for f in result.verdict.findings],
+        },
+        arms=dict(result.system.description["arms"]),
+        measurements=dict(result.system.description["measurements"]),
+        statics=dict(result.system.description["statics"]),
+        groups={owner: tuple(keys) for owner, keys in result.fit.problem.blueprint.groups.items()},
+        parameters=parameter_records(estimate),
+        prediction=result.prediction,
+        information=information,
+    )
+    system, registry = result.system, experiment.registry
+    parameters = system.parameters(record.groups).with_nominal(estimate.values)
+    calibration = Calibration(system, parameters, record)
+    try:
+        calibration = calibration.checked(check_poses(system, result.dataset, result.split.train), registry)
+    except NotConvergedError:  # the arm does not settle at the check poses
+        calibration = calibration.checked(None, registry)
+    return dict(finite(calibration.record.to_config()))
+
+
+def read_back(text: str, registry: PluginRegistry) -> Calibration:
+    """The calibration that a text is once it is a file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CalibrationWarning)
+        return Calibration.load("calibration.yaml", registry, content=text.encode())
+
+
+def _noise(result: RunResult) -> dict[str, Any]:
+    estimate = result.estimate
+    fit = {"scale": estimate.noise_scale, "degrees_of_freedom": estimate.degrees_of_freedom}
+    return {**fit, **result.noise}
+
+
+def residuals_text(result: RunResult) -> str:
+    """A row a record, worst found easily by sorting."""
+    errors, dataset = result.errors, result.dataset
+    held = np.zeros(len(dataset), dtype=bool)
+    held[result.split.holdout] = True
+    weights = np.full(len(dataset), np.nan)  # the least one of a record that has several
+    weights[result.split.train] = np.min(np.array(result.fit.fitted.weights), axis=0)
+    numbered = [f"residual{i}_{errors.unit}" for i in range(1, len(errors.calibrated_residual_mm) + 1)]
+    axes = list(errors.residual_columns) or numbered
+    columns = ["pose_id", "source_row", "set", "weight"]
+    models, turns = ("nominal", "calibrated", "cross_validated"), errors.turns
+    columns += [*(f"{model}_{errors.unit}" for model in models), *axes]
+    columns += [f"{model}_deg" for model in models if turns]
+    rows: list[list[object]] = [[*columns]]
+    for i, record in enumerate(dataset.ids):
+        row = dataset.rows[i] if dataset.rows else ""
+        weight = "" if held[i] else f"{weights[i]:.6g}"
+        numbers = [errors.nominal_mm[i], errors.calibrated_mm[i], errors.cross_validated_mm[i]]
+        turned = [turns.nominal_deg[i], turns.calibrated_deg[i], turns.cross_validated_deg[i]] if turns else []
+        residual = errors.calibrated_residual_mm[:, i]
+        rows.append([record, row, "holdout" if held[i] else "train", weight, *numbers, *residual, *turned])
+    return csv_text(rows)
+
+
+def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
+    bootstrap = result.bootstrap
+    if bootstrap is None:
+        return None
+    rows = zip(bootstrap.names, bootstrap.deviations, bootstrap.intervals, strict=True)
+    return {
+        "refits": len(bootstrap.values),
+        "failed": bootstrap.failed,
+        "block_records": bootstrap.block,
+        "parameters": {
+            name: finite({"sd": float(sd), "lower": float(low), "upper": float(high)}) for name, sd, (low, high) in rows
+        },
+    }

@@ -23,14 +23,16 @@ from armcal.config.yaml_source import VARIANTS, ConfigSource, load_variants
 from armcal.diagnose.fit import Prepared
 from armcal.errors import ConfigError, DataError, InputError, Location, NotConvergedError, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.estimate.identifiability import require_solvable
+from armcal.estimate.identifiability import candidates, freeing, require_solvable
 from armcal.estimate.polish import restricted, untrained
+from armcal.estimate.robust import fit
 from armcal.estimate.uncertainty import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.validation import (
     ErrorSummary,
     FitTask,
     JudgedFit,
     Split,
+    cross_validate,
     error_unit,
     errors_and_turns,
     fit_and_judge,
@@ -43,7 +45,7 @@ from armcal.measure.csv_writer import csv_text
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, ExperimentSettings, ValidationSettings
-from armcal.run.pipeline import Stopwatch, prepare
+from armcal.run.pipeline import Stopwatch, acting, prepare
 from armcal.run.pose_residual import Layer, judged_with, layer_of
 
 R = TypeVar("R")
@@ -329,12 +331,7 @@ def compare(
     progress: Progress = no_progress,
     watch: Stopwatch | None = None,
 ) -> StudyResult:
-    """Judge every variant by cross-validation.
-
-    Raises:
-        InputError: a variant cannot be solved, variants do not use the same records, or there are no two groups.
-        NotConvergedError: of every variant some fit failed.
-    """
+    """Judge every variant by cross-validation."""
     watch, settings = watch or Stopwatch(), study.settings
     with watch.stage("prepare"):
         ready = study.prepare(progress)
@@ -643,3 +640,74 @@ def _csv_text(result: StudyResult) -> str:
     rows = dataset.rows or ("",) * len(dataset)
     body = zip(dataset.ids, rows, *columns.values(), strict=True)
     return csv_text([["pose_id", "source_row", *columns], *body])
+
+
+_FOLDS = 5
+_MOST_STEPS = 6
+_STANDARD_ERRORS, _LEAST_GAIN = 2.6, 0.01
+"""What a gain on records held out must be: in its standard errors, and of the error."""
+
+
+@dataclass(frozen=True)
+class FreedStep:
+    """A fixed parameter, freed beside those before it; ``error`` is the mean of records held out (None: not judged)."""
+
+    name: str
+    unit: str
+    change: tuple[float, ...]  # of its coordinates, to first order (SI)
+    sd: tuple[float, ...]
+    p_value: float
+    error: float | None  # in the unit of errors
+    recommended: bool
+
+
+@dataclass(frozen=True)
+class FixedParameters:
+    """What fixed parameters would gain, as JSON has it."""
+
+    unit: str  # of errors
+    error: float | None  # mean error of records held out, as configured
+    gaining: tuple[FreedStep, ...]  # parameters that explain residuals, in the order in which they are freed
+    recommended: tuple[str, ...]  # to be freed: none if held-out errors do not fall by more than chance, and by 1 %
+    determined_and_nothing_gained: tuple[str, ...]
+
+
+def fixed_parameters(experiment: Experiment, ready: Prepared, progress: Progress = no_progress) -> FixedParameters:
+    """Fit with what is configured, look for what it leaves, and cross-validate what is found."""
+    parameters = ready.problem.parameters
+    # The problem with every candidate free, too: functions for whatever is chosen of them.
+    system, own = experiment.system, [block.name for block in parameters.free]
+    freer = parameters.with_free([*own, *candidates(parameters)])
+    groups, evaluator = ready.problem.blueprint.groups, experiment.settings.evaluator
+    built = (system.arms, system.measurements, freer, system.environment, ready.dataset, evaluator, groups)
+    wide = Problem.build(*built)
+    train = ready.split.train
+    wide = acting(wide, ready.dataset).subset(train)
+    start = next(iter(ready.start.values(ready.problem)), parameters.nominal())
+    fitted = fit(wide.with_parameters(parameters), experiment.estimator, start, progress)
+    values = fitted.solution.values
+    gaining, others = freeing(wide.with_records(fitted.problem.records), own, values)
+    determined = tuple(one.name for one in others)
+    unit = error_unit(ready.problem)
+    if not gaining:
+        return FixedParameters(unit, None, (), (), determined)
+    splits = folds(len(train), _FOLDS, 0, experiment.poses(ready.dataset.subset(train)))
+    names = [one.name for one in gaining]
+
+    def errors_with(count: int) -> Array:
+        problem = wide.with_parameters(parameters.with_free([*own, *names[:count]]))
+        return cross_validate(problem, splits, experiment.estimator, values, progress).errors
+
+    counts = sorted({*range(min(len(names), _MOST_STEPS) + 1), len(names)})
+    errors, best = {count: errors_with(count) for count in counts}, 0
+    for count in counts[1:]:
+        gains = errors[best] - errors[count]
+        chance = _STANDARD_ERRORS * float(np.std(gains)) / np.sqrt(len(gains))
+        if np.mean(gains) > max(chance, _LEAST_GAIN * float(np.mean(errors[best]))):
+            best = count
+    means = {count: 1000 * float(np.mean(error)) for count, error in errors.items()}
+    steps = []
+    for i, one in enumerate(gaining, 1):
+        numbers = (tuple(one.change.tolist()), tuple(one.sd.tolist()), one.p_value)
+        steps.append(FreedStep(one.name, parameters[one.name].unit, *numbers, means.get(i), i <= best))
+    return FixedParameters(unit, means[0], tuple(steps), tuple(names[:best]), determined)

@@ -24,7 +24,7 @@ from armcal.plugins import PluginRegistry
 from armcal.problem.variants import factor_at_zero
 from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document
-from armcal.run import outputs
+from armcal.run import result as results
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from armcal.run.result import RunResult
@@ -183,8 +183,8 @@ def try_out(folder: Path, registry: PluginRegistry, command: str = "", progress:
     result = calibrate(experiment, command, progress, watch)
     result.seconds["total"] = watch.total()
     document = run_document(result, plugin_sections(result, registry)[0])
-    with outputs.reserved(folder / RESULTS) as held:
-        outputs.write(held, result, experiment, page(document))
+    with results.reserved(folder / RESULTS) as held:
+        results.write(held, result, experiment, page(document))
     held_out = (of["holdout"].mean for of in (result.table.nominal, result.table.calibrated))
     return Trial(result, *(math.nan if error is None else error for error in held_out))
 

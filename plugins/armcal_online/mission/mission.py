@@ -32,8 +32,8 @@ from armcal.measure.csv_writer import csv_text, write_csv
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal.run.outputs import calibration_content
 from armcal.run.pipeline import calibrate
+from armcal.run.result import calibration_content
 from pydantic import Field, model_validator
 from typing_extensions import override
 

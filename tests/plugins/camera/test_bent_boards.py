@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 from armcal.run.experiment import Experiment
-from armcal.run.fixed_parameters import fixed_parameters
 from armcal.run.pipeline import Stopwatch, prepare
+from armcal.run.study import fixed_parameters
 from armcal_camera.camera import bent
 
 from tests.plugins.camera.simulated_views import base_T, estimated, numbers, pose, simulated

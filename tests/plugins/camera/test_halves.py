@@ -71,7 +71,7 @@ def test_where_the_arm_errs_weights_are_not_ranked_by_pixels(tmp_path: Path, mou
 @pytest.mark.parametrize("mounting", ["eye_in_hand", "eye_to_hand"])
 def test_a_perfect_arm_is_judged_by_pixels(tmp_path: Path, mounting: str) -> None:
     result, _ = run(tmp_path, mounting, 1, 0.0)
-    components = result.noise.components
+    components = result.fit.fitted.components
     assert components is not None and not components.mostly_joints
     assert not any("its pose differs between halves" in finding.text for finding in result.verdict.findings)
 
