@@ -18,7 +18,7 @@ from pathlib import Path
 TESTS = Path(__file__).resolve().parent
 LONGEST_S = 120
 LIBRARIES = ("casadi", "jinja2", "numpy", "pydantic", "rich.console", "scipy.optimize", "scipy.spatial", "yaml")
-CORE = ("cli.check", "cli.plugins", "cli.predict", "cli.run", "cli.simulate", "report.page", "run.outputs")
+CORE = ("cli.check", "cli.plugins", "cli.predict", "cli.run", "cli.simulate", "report.page", "run.result")
 Ran = subprocess.CompletedProcess[str]
 
 

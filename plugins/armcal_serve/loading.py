@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import lost_calibration
@@ -27,9 +27,6 @@ from armcal.io.plain_files import input_file
 
 from armcal_serve.answers import Answerer
 from armcal_serve.served_arm import TEMPERATURE, TEMPERATURE_KEY, ServedArm
-
-if TYPE_CHECKING:
-    from armcal.run.plan_poses import Workspace
 
 LOOK_S = 0.2  # How often the file is looked at
 _ORDINARY_C = 20.0
@@ -56,7 +53,7 @@ class Loader:
     accept: bool = False
     sequence: int = field(init=False, default=0)  # of the calibration that was loaded last
     _arms: Mapping[str, Any] = field(init=False, default_factory=dict)  # its arms, as it describes them
-    _spaces: dict[str, "Workspace"] = field(init=False, default_factory=dict)  # by arm, where there are limits
+    _options: dict[str, Options] = field(init=False, default_factory=dict)  # by arm, where there are limits
     _last: Mapping[str, ServedArm] = field(init=False, default_factory=dict)  # by name
 
     def load(self, data: bytes) -> tuple[Answerer, list[str]]:
@@ -117,18 +114,16 @@ class Loader:
         self, calibration: Calibration, name: str, conditions: tuple[str, ...], before: Compensator | None
     ) -> Compensator:
         """Made of what was compiled for the calibration before, where it can be."""
-        if self.within and name not in self._spaces:
+        if self.within and name not in self._options:
             from armcal.plugins import discover  # late: not needed without limits
-            from armcal.run.plan_poses import workspace_of
+            from armcal.run.plan_poses import options_within
 
             joints = tuple(calibration.system.arms[name].commanded)
-            self._spaces[name] = workspace_of(Path(self.within), joints, discover())
-        space = self._spaces.get(name)
-        limits, allowed = (space.limits, space.allowed) if space else ({}, None)
-        options, like = Options(limits=limits), before.expression if before else None
+            self._options[name] = options_within(Path(self.within), joints, discover())
+        options, like = self._options.get(name), before.expression if before else None
         expression = calibration.expression(name, conditions, self.point, calibration.free, like)
         try:
-            return Compensator(expression, calibration.parameters, options, allowed, self.evaluator)
+            return Compensator(expression, calibration.parameters, options, self.evaluator)
         except ValueError as fault:
             hint = "Correct the limits in the plan."
             raise ConfigError(f"{fault}.", where=Location(self.within or self.shown), hint=hint) from fault

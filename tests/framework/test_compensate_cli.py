@@ -239,7 +239,7 @@ def test_one_arm_of_two(tmp_path: Path) -> None:
     place = 1000 * both.forward(np.full((1, 7), 0.3), "right")[0, :3, 3]
     targets.write_text("x_mm,y_mm,z_mm\n" + ",".join(map(str, place)) + "\n", encoding="utf-8")
     asked = ("compensate", path, "--targets", targets, "--out", out)
-    assert "2 arms, left, right. Choose: --arm NAME." in told(armcal(*asked), 2)
+    assert "found the arms left, right. Choose one with --arm NAME." in told(armcal(*asked), 2)
     told(armcal(*asked, "--arm", "right"))
     row = next(csv.DictReader(out.open(encoding="utf-8")))
     q = np.radians([[float(row[next(c for c in row if c.endswith(f"q{i}_deg"))]) for i in range(1, 8)]])
@@ -465,9 +465,10 @@ def test_the_nominal_arm_itself_is_sent_its_targets(arms) -> None:
     nominal = arms[2]
     targets = nominal.targets(np.array([[0.17, -0.02, 0.16], [0.22, 0.02, 0.2]]), np.array([TURNED.as_matrix()] * 2))
     commands = nominal.solve(targets)
-    poses = sent(nominal, targets, commands)
+    poses = sent(nominal, commands)
     assert commands.reached.all()
-    assert np.abs(poses.shifts).max() < 1e-8 and np.abs(poses.turns).max() < 1e-7
+    assert np.abs(poses[:, :3, 3] - targets.positions).max() < 1e-8
+    assert np.abs(poses[:, :3, :3] - TURNED.as_matrix()).max() < 1e-7
 
 
 def test_assessing_needs_no_prediction_of_errors() -> None:

@@ -281,7 +281,7 @@ def test_more_than_the_springs_hold_is_not_had() -> None:
 
 def test_clearance_chooses_the_other_posture() -> None:
     """Elbow down is forbidden."""
-    found = with_options("rigid", Options(), allowed=lambda q: q[2] > 0)
+    found = with_options("rigid", Options(allowed=lambda q: q[2] > 0))
     free = compensator("rigid")
     commands = found.solve(of(free, np.array([[0.3, 0.8, -0.9], [0.5, 0.9, -0.5], [0.1, 0.2, 0.7]])))
     assert commands.reached.all()
@@ -290,7 +290,7 @@ def test_clearance_chooses_the_other_posture() -> None:
 
 @pytest.mark.parametrize("name", ["rigid", "servos"])
 def test_clearance_that_forbids_everything_says_so(name: str) -> None:
-    found = with_options(name, Options(), allowed=lambda q: np.zeros(q.shape[1], dtype=bool))
+    found = with_options(name, Options(allowed=lambda q: np.zeros(q.shape[1], dtype=bool)))
     commands = found.solve(of(compensator(name), np.array([[0.3, 0.8, -0.9], [0.1, 0.2, 0.7]])))
     assert not commands.reached.any()
     assert set(commands.reasons) == {"all commands found that reach it are too near to something"}
@@ -299,7 +299,7 @@ def test_clearance_that_forbids_everything_says_so(name: str) -> None:
 def test_counts_that_stand_too_near_are_not_had() -> None:
     """Exact commands are allowed, all counts about them are not."""
     at = np.array([0.3, 0.8, -0.9])
-    found = with_options("servos", Options(), allowed=lambda q: np.abs(q - at[:, None]).max(axis=0) < 1e-5)
+    found = with_options("servos", Options(allowed=lambda q: np.abs(q - at[:, None]).max(axis=0) < 1e-5))
     target = exact(compensator("servos"), at[None], acting(found, 1))[:, :3, 3]
     commands = found.solve(found.targets(target), at)
     assert not commands.reached[0]

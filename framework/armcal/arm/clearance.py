@@ -8,11 +8,11 @@ nominal parameters and rigid: what springs give is to be left in the margins.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import casadi as ca
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from armcal.arm.assembly import Arm
 from armcal.arm.model import forward
@@ -32,17 +32,35 @@ class Point(Settings):
     at: Length3 = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class Capsule:
-    """All that lies within ``radius`` (m) of a segment; a ball where both ends are one."""
+class Capsule(Settings):
+    """All that lies within ``radius`` of the segment from ``start`` to ``end``."""
 
     start: Point
     end: Point
-    radius: float
+    radius: Annotated[Length, Field(ge=0)]
+    type: Literal["capsule"] = "capsule"
 
     @property
     def frames(self) -> tuple[str, ...]:
         return (self.start.frame, self.end.frame)
+
+
+class Ball(Settings):
+    """All that lies within ``radius`` of ``centre``."""
+
+    centre: Point
+    radius: Annotated[Length, Field(ge=0)]
+    type: Literal["ball"] = "ball"
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        return (self.centre.frame,)
+
+    @property
+    def start(self) -> Point:
+        return self.centre
+
+    end = start
 
 
 class Box(Settings):
@@ -81,7 +99,8 @@ class HalfSpace(Settings):
         return (BASE_FRAME,)
 
 
-Shape = Capsule | Box | HalfSpace
+Shape = Annotated[Capsule | Ball | Box | HalfSpace, Field(discriminator="type")]
+_ROUND = (Capsule, Ball)
 _TOOL = Point(frame=TOOL_FRAME)
 
 
@@ -96,13 +115,15 @@ class Rule(Settings):
     besides: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Clearance:
-    """Parts by name, the rules they keep, and regions that the tool point stays out of (boxes and balls)."""
+class Clearance(Settings):
+    """The arm's parts and its surroundings by name, and how far they keep from each other.
 
-    parts: Mapping[str, tuple[Shape, ...]]
-    rules: tuple[Rule, ...]
-    forbidden: tuple[Box | Capsule, ...] = ()
+    ``forbidden`` are boxes and balls that the tool point stays out of.
+    """
+
+    parts: dict[str, tuple[Shape, ...]] = Field(default_factory=dict)
+    rules: tuple[Rule, ...] = ()
+    forbidden: tuple[Annotated[Box | Ball, Field(discriminator="type")], ...] = ()
 
     def pairs(self, rule: Rule, moved_by: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
         """The pairs of parts that a rule is about; ``moved_by`` gives each frame's joint (0: none)."""
@@ -144,7 +165,7 @@ class ClearanceCheck:
         self._clearance = clearance
         moved_by = joints_of_frames(arm)
         self._pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
-        capsules = [shape for shapes in clearance.parts.values() for shape in shapes if isinstance(shape, Capsule)]
+        capsules = [shape for shapes in clearance.parts.values() for shape in shapes if isinstance(shape, _ROUND)]
         points = {point for capsule in capsules for point in (capsule.start, capsule.end)}
         self._points = [_TOOL, *sorted(points, key=repr)]
         self._function = _point_function(arm, self._points)
@@ -182,11 +203,11 @@ class ClearanceCheck:
                 margins[row] = np.minimum(margins[row], known[pair] - rule.at_least)
         tool = where[_TOOL]
         for region in self._clearance.forbidden:
-            margins[-1] = np.minimum(margins[-1], distance(Capsule(_TOOL, _TOOL, 0.0), region, where))
+            margins[-1] = np.minimum(margins[-1], distance(Ball(_TOOL, 0.0), region, where))
             if isinstance(region, Box):
                 inside = np.all((tool >= region.low) & (tool <= region.high), axis=1)
             else:
-                inside = np.linalg.norm(tool - np.array(region.start.at), axis=1) <= region.radius
+                inside = np.linalg.norm(tool - np.array(region.centre.at), axis=1) <= region.radius
             margins[-1, inside] = np.minimum(margins[-1, inside], -_NO_LENGTH)
         return margins
 
@@ -194,7 +215,7 @@ class ClearanceCheck:
         least = np.full(count, np.inf)
         for first in self._clearance.parts[pair[0]]:
             for second in self._clearance.parts[pair[1]]:
-                if isinstance(first, Capsule) or isinstance(second, Capsule):
+                if isinstance(first, _ROUND) or isinstance(second, _ROUND):
                     least = np.minimum(least, distance(first, second, where))
         return least
 
@@ -204,12 +225,12 @@ def distance(first: Shape, second: Shape, where: Mapping[Point, Array]) -> Array
 
     One of them must be a capsule.
     """
-    if not isinstance(first, Capsule):
+    if not isinstance(first, _ROUND):
         first, second = second, first
-    if not isinstance(first, Capsule):
+    if not isinstance(first, _ROUND):
         raise ValueError("two fixed bodies need no check")
     start, end = (where[p] if p in where else np.array([p.at]) for p in (first.start, first.end))
-    if isinstance(second, Capsule):
+    if isinstance(second, _ROUND):
         others = (where[p] if p in where else np.array([p.at]) for p in (second.start, second.end))
         return segment_to_segment(start, end, *others) - first.radius - second.radius
     if isinstance(second, Box):

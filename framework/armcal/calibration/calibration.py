@@ -371,14 +371,13 @@ class Calibration:
         return np.asarray(poses[0])
 
 
-def arm_named(calibration: Calibration, arm: str | None) -> str:
-    """The arm of this name, or the only one if there is no name."""
-    arms = calibration.system.arms
+def arm_named(arms: Collection[str], arm: str | None, where: Location | None = None, option: str = "--arm NAME") -> str:
+    """The arm of this name, or the only one if there is no name; ConfigError if there is none such, or are several."""
     if arm is None and len(arms) > 1:
-        raise ConfigError(f"the calibration has {len(arms)} arms, {', '.join(arms)}.", hint="Choose: --arm NAME.")
+        raise ConfigError(f"found the arms {', '.join(arms)}.", where=where, hint=f"Choose one with {option}.")
     name = next(iter(arms)) if arm is None else arm
     if name not in arms:
-        raise ConfigError(f"no arm is called {name!r}.", hint=f"The arms are {', '.join(arms)}.")
+        raise ConfigError(f"no arm is called {name!r}.", where=where, hint=f"The arms are {', '.join(arms)}.")
     return name
 
 
@@ -463,9 +462,7 @@ def zeros_of(path: Path, arm: str | None, registry: PluginRegistry) -> tuple[dic
     """
     loaded, where = Calibration.load(path, registry), Location(str(path))
     arms = loaded.system.arms
-    if arm not in arms and (arm is not None or len(arms) > 1):
-        raise InputError(f"found the arms {', '.join(arms)}.", where=where, hint="Choose one with --arm-name NAME.")
-    chosen = arms[arm or next(iter(arms))]
+    chosen = arms[arm_named(arms, arm, where, "--arm-name NAME")]
     stated = {f"{chosen.name}.{n}.{p}": j for n, effect in chosen.effects.items() for p, j in effect.zeros().items()}
     zeros: dict[str, Zero] = {}
     reasons = dict.fromkeys(chosen.commanded, "its zero was not free")

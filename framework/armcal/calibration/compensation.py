@@ -168,12 +168,14 @@ class Options:
         reach_m: targets of this size count as had (m).
         reach_rad: and of this size of turn (rad).
         seed: of the random starts.
+        allowed: from commands (n x N) to whether the arm may be there (N); None where it may be anywhere.
     """
 
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     reach_m: float = 1e-9
     reach_rad: float = 1e-8
     seed: int = 0
+    allowed: Allowed | None = None
 
 
 def _check(what: str, array: Array, shape: tuple[int, ...]) -> None:
@@ -459,7 +461,6 @@ class Compensator:
         expression: ToolExpression,
         parameters: Parameters,
         options: Options | None = None,
-        allowed: Allowed | None = None,
         choice: EvaluatorChoice = "auto",
     ) -> None:
         """Build it.
@@ -468,7 +469,6 @@ class Compensator:
             expression: the calibrated arm's.
             parameters: its calibrated values.
             options: how commands are chosen.
-            allowed: from commands (n x N) to whether the arm may be there (N).
             choice: of evaluator: compiled C, or CasADi's interpreter.
 
         Raises:
@@ -476,6 +476,7 @@ class Compensator:
         """
         self.expression, self.options = expression, options or Options()
         coupled = partial(within_couplings, [expression.arm]) if expression.arm.couplings else None
+        allowed = self.options.allowed
         self._allowed = (lambda q: allowed(q) & coupled(q)) if allowed and coupled else allowed or coupled
         self.limits = command_limits(expression, self.options.limits)
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
@@ -771,15 +772,6 @@ def _goal(targets: Targets) -> Array:
     return np.concatenate([targets.positions.T, targets.rotations.transpose(0, 2, 1).reshape(-1, 9).T])
 
 
-@dataclass(frozen=True)
-class Sent:
-    """Poses that make the nominal arm's inverse kinematics give the commands of the real arm."""
-
-    poses: Array  # of the point that is brought to targets, in the base frame (N x 4 x 4)
-    shifts: Array  # from the targets to these (N x 3; m)
-    turns: Array | None  # rotation vectors in the base frame (N x 3; rad); None where only positions count
-
-
 def nominal_arm(
     arm: Arm, parameters: Parameters, environment: Environment, options: Options, tool_T_point: Transform | None = None
 ) -> Compensator:
@@ -788,8 +780,8 @@ def nominal_arm(
     return Compensator(expression if tool_T_point is None else expression.at(tool_T_point), parameters, options)
 
 
-def sent(nominal: Compensator, targets: Targets, commands: Commands) -> Sent:
-    """Where the nominal arm takes commands of the real arm to lead; nan of targets that are not reached."""
-    poses = np.where(commands.reached[:, None, None], nominal.forward(commands.joint_angles), np.nan)
-    turns = None if targets.rotations is None else turn_between(targets.rotations, poses[:, :3, :3])
-    return Sent(poses, np.asarray(poses[:, :3, 3] - targets.positions), turns)
+def sent(nominal: Compensator, commands: Commands) -> Array:
+    """Poses of the point that arrives (N x 4 x 4; base frame) that make the nominal arm's inverse kinematics give the
+    commands of the real arm; nan of targets that are not reached.
+    """
+    return np.where(commands.reached[:, None, None], nominal.forward(commands.joint_angles), np.nan)

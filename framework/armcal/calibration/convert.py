@@ -21,7 +21,7 @@ from armcal.arm.model import ArmModel, Chain
 from armcal.base.arrays import Array
 from armcal.base.config_text import shown
 from armcal.base.quaternions import quaternion_of, rpy_of
-from armcal.calibration.calibration import Calibration
+from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.rigid_chain import (
     RigidChain,
     RigidJoint,
@@ -105,15 +105,7 @@ def _named(source: ConfigSource, arm: str | None) -> str:
         raise ConfigError(
             "found no arms.", where=Location(str(source.path)), hint="Give a configuration or a calibration.yaml."
         )
-    if arm is None and len(arms) > 1:
-        raise ConfigError(
-            f"found the arms {', '.join(arms)}.", where=source.where(("arms",)), hint="Choose one with --arm NAME."
-        )
-    name = str(next(iter(arms))) if arm is None else arm
-    if name not in arms:
-        raise ConfigError(
-            f"no arm is called {name!r}.", where=source.where(("arms",)), hint=f"The arms are {', '.join(arms)}."
-        )
+    name = arm_named([str(own) for own in arms], arm, source.where(("arms",)))
     if not isinstance(arms[name], dict) or "model" not in arms[name]:
         source.refuse(("arms", name), f"the arm {name!r} has no model.", "Write model: {type: NAME, ...}.")
     return name

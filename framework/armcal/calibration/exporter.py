@@ -137,7 +137,7 @@ def changed_numbers(request: ExportRequest) -> int:
 
 def request_of(calibration: Calibration, arm: str | None, out: str = "") -> ExportRequest:
     """What a calibration says of one arm, of its only one if no name is given; ``out`` names the file to be written."""
-    arms, name = calibration.system.arms, arm_named(calibration, arm)
+    arms, name = calibration.system.arms, arm_named(calibration.system.arms, arm)
     values = {block.name: np.array(block.nominal) for block in calibration.parameters.blocks}
     own = {block.name for block in arms[name].parameters()}
     record, instruments = calibration.record, {}

@@ -39,7 +39,7 @@ class PredictionRecord(Settings):
     """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, what drifts.
 
     ``columns`` are what the calibration's data called its columns; ``ranges`` those of joints and payload in its
-    records (SI; see ``recorded_range``).
+    records (SI; see ``recorded_ranges``).
     """
 
     entries: tuple[str, ...]

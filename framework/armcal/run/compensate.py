@@ -15,8 +15,9 @@ from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of, rotation_matrix, rpy_matrices
 from armcal.base.units import DIMENSIONLESS, UNITS, split_suffix
 from armcal.calibration.calibration import Calibration, arm_named
-from armcal.calibration.compensation import Commands, Compensator, Options, Reach, Sent, Targets, nominal_arm
+from armcal.calibration.compensation import Commands, Compensator, Options, Reach, Targets, nominal_arm
 from armcal.calibration.inverse import FARTHEST_M
+from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import (
     APPROACH,
     MeasuredPoint,
@@ -31,7 +32,7 @@ from armcal.measure.checks import noticed, records_of
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels, surroundings
 from armcal.plugins import PluginRegistry
-from armcal.run.plan_poses import Workspace, workspace_of
+from armcal.run.plan_poses import options_within
 
 _WORTH_COMPILING = 5000  # From this many targets on, waiting for the compiler costs less than doing without it
 Column = tuple[str, tuple[str, ...]]
@@ -173,8 +174,7 @@ class Bench:
 
     calibration: Calibration  # as loaded
     arm: str  # its instance name
-    options: Options  # of compensation
-    space: Workspace  # where it may go
+    options: Options  # of compensation, with where it may go
     target: MeasuredPoint | None  # what its instrument reads, if it reads a point of the tool
     point: Point = "tool"  # what is brought to targets
 
@@ -188,12 +188,11 @@ class Bench:
         point: Point = "tool",
     ) -> Self:
         """One arm (the only one if no name is given), with the limits and the clearance of a configuration's plan."""
-        name = arm_named(calibration, arm)
+        name = arm_named(calibration.system.arms, arm)
         joints = tuple(calibration.system.arms[name].commanded)
-        space = workspace_of(within, joints, registry) if within else Workspace()
         target = measured_point(calibration.system, name, calibration.parameters.with_free(calibration.free))
-        options = Options(limits=space.limits)
-        return cls(calibration, name, options, space, target, point)
+        options = options_within(within, joints, registry) if within else Options()
+        return cls(calibration, name, options, target, point)
 
     @property
     def is_judged(self) -> bool:
@@ -213,7 +212,7 @@ class Bench:
         choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
         try:
             expression = self.calibration.expression(self.arm, conditions, self.point)
-            return Compensator(expression, self.calibration.parameters, self.options, self.space.allowed, choice)
+            return Compensator(expression, self.calibration.parameters, self.options, choice)
         except ValueError as fault:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
 
@@ -221,7 +220,7 @@ class Bench:
         """The arm as its controller has it."""
         system, nominal = self.calibration.system, self.calibration.nominal
         at = tool_point(self.point, system, self.arm, nominal)
-        return nominal_arm(system.arms[self.arm], nominal, system.environment, self.options, at)
+        return nominal_arm(system.arms[self.arm], nominal, system.environment, replace(self.options, allowed=None), at)
 
 
 def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: Commands) -> Assessed:
@@ -287,7 +286,7 @@ def write_commands(
     given: Dataset,
     assessed: Assessed,
     angle_unit: str,
-    sent: Sent | None = None,
+    sent: Array | None = None,
 ) -> None:
     """Write commands beside the targets' own ids, angles in ``deg`` or ``rad``; or what a nominal controller is sent.
 
@@ -303,7 +302,7 @@ def write_commands(
         or (sent is None and APPROACH in channel and values.any())
     }
     requested = requested_channels({name: arm}, {}, measured=False)
-    first = _counts(compensator, assessed.commands) if sent is None else _corrected(sent)
+    first = _counts(compensator, assessed.commands) if sent is None else _corrected(sent, targets)
     extra = dict([*first, *_columns(compensator, assessed)])
     # A target file may be a pose file: its commands, in whatever unit, give way to those that were found.
     own = {f"{joint}_{unit}" for joint in compensator.joints for unit in UNITS}
@@ -320,12 +319,13 @@ def _counts(compensator: Compensator, commands: Commands) -> Iterator[Column]:
             yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
 
 
-def _corrected(sent: Sent) -> Iterator[Column]:
-    yield from _pose("", sent.poses)
-    for i, axis in enumerate("xyz"):
-        yield f"d{axis}_mm", _exact(1000 * sent.shifts[:, i])
-    if sent.turns is not None:
-        for axis, turns in zip("xyz", sent.turns.T, strict=True):
+def _corrected(sent: Array, targets: Targets) -> Iterator[Column]:
+    """Poses that a nominal controller is sent, and how far the targets are shifted and turned to these."""
+    yield from _pose("", sent)
+    for axis, shifts in zip("xyz", sent[:, :3, 3].T - targets.positions.T, strict=True):
+        yield f"d{axis}_mm", _exact(1000 * shifts)
+    if targets.rotations is not None:
+        for axis, turns in zip("xyz", turn_between(targets.rotations, sent[:, :3, :3]).T, strict=True):
             yield f"turn_{axis}_rad", _exact(turns)
 
 

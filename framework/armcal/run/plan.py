@@ -27,7 +27,7 @@ from armcal.calibration.tool_expression import arm_expression
 from armcal.errors import ConfigError, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, deviations, measures_of
-from armcal.estimate.simulation import with_channels
+from armcal.estimate.simulation import approach_of, with_channels
 from armcal.measure.groups import grouped_instances
 from armcal.planning.candidates import (
     Candidates,
@@ -141,7 +141,7 @@ def in_order_of_visit(context: PlanContext, chosen: Dataset, *, keeps_approaches
     times = travel_times(chosen.stacked(space.channels), np.concatenate(speeds))
     order = quick_order(times) if settings.order == "travel" else np.arange(len(chosen))
     visited = chosen.subset(order)
-    by_order = _approaches(visited, space)
+    by_order = dict(zip(approach_channels(space), approach_of(visited.stacked(space.channels)), strict=True))
     channels = by_order | dict(visited.channels) if keeps_approaches else dict(visited.channels) | by_order
     numbers = tuple(str(i) for i in range(1, len(order) + 1))
     return replace(visited, channels=channels, extra={"order": numbers}), path_time(times, order)
@@ -187,17 +187,6 @@ def quick_order(times: Array) -> Indices:
         if not improved:
             break
     return order
-
-
-def _approaches(visited: Dataset, space: JointSpace) -> dict[str, Array]:
-    """The sign of each joint's last motion before each pose (N), 0 before its first."""
-    approaches = {}
-    for channel in space.channels:
-        command, (arm, _, joint) = visited.column(channel), channel.partition(".")
-        signs = np.sign(np.diff(command, prepend=command[:1]))
-        moved = np.maximum.accumulate(np.where(signs != 0, np.arange(len(signs)), 0))
-        approaches[f"{arm}.approach.{joint}"] = signs[moved]
-    return approaches
 
 
 APPROACH_ROOM = np.deg2rad(3.0)  # A joint that is come to from a side comes from as far: more than servos have play
@@ -571,8 +560,9 @@ def make_iso_plan(
     compensator = Compensator(
         arm_expression(plain, parameters, experiment.system.environment),
         parameters,
-        Options(limits={name: (low, high) for name, (low, high) in zip(space.names, limits.tolist(), strict=True)}),
-        check,
+        Options(
+            {name: (low, high) for name, (low, high) in zip(space.names, limits.tolist(), strict=True)}, allowed=check
+        ),
     )
     pool = spread(settings.model_copy(update={"count": _POSTURES}), space, limits, check)
     cube = _placed(compensator, pool.dataset.stacked(space.channels).T, size)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -14,6 +14,7 @@ from armcal.arm.assembly import command_channels, shown_joint, within_couplings
 from armcal.arm.joints import Limits, by_dimension
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
+from armcal.calibration.compensation import Options
 from armcal.calibration.inverse import Allowed
 from armcal.config.system import build_component
 from armcal.errors import ConfigError, Location, ProblemError
@@ -213,16 +214,8 @@ def _grid(settings: PlanSettings, space: JointSpace) -> Dataset:
     return dataset_of(np.array([axis.ravel() for axis in axes]), space)
 
 
-@dataclass(frozen=True)
-class Workspace:
-    """Limits by joint (rad or m), and from commands (n x N) to whether nothing is too near (N); None: all may be."""
-
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    allowed: Allowed | None = None
-
-
-def workspace_of(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Workspace:
-    """Limits and clearance of a configuration's ``plan``, for an arm with these joints."""
+def options_within(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Options:
+    """Compensation within limits and clearance of a configuration's ``plan``, for an arm with these joints."""
     experiment = Experiment.load(path, registry=registry)
     plan = experiment.settings.plan
     if plan is None:
@@ -240,4 +233,4 @@ def workspace_of(path: Path, joints: Sequence[str], registry: PluginRegistry) ->
         )
     stated = zip(space.names, space.limits(plan), strict=True)
     limits = {name: (float(low), float(high)) for name, (low, high) in stated if np.isfinite([low, high]).any()}
-    return Workspace(limits, clearance_of(experiment))
+    return Options(limits, allowed=clearance_of(experiment))

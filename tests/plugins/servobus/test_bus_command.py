@@ -185,7 +185,7 @@ def test_calibrated_zeros_go_into_the_servos(tmp_path):
         config = written(tmp_path, desk.path, joints=joints)
         before = json.loads(called("check", config, "--json").stdout)["joints"]
         zeros = ("home", config, "--calibration", tmp_path / "run" / "calibration.yaml", "--yes")
-        assert "found the arms arm." in refusal(called(*zeros, "--arm-name", "left"))
+        assert "no arm is called 'left'. The arms are arm." in refusal(called(*zeros, "--arm-name", "left"))
         ran = called(*zeros)
         assert ran.exit_code == 0 and "set them to 0" in ran.output, ran.output
         after = json.loads(called("check", config, "--json").stdout)["joints"]
