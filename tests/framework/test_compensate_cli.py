@@ -14,8 +14,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation import Compensator, Options, sent
 from armcal.cli.main import cli
 from armcal.plugins import discover
-from armcal.run import compensate as run_compensate
-from armcal.run.compensate import Bench
+from armcal.run.compensate import Answer, Bench
 from click.testing import CliRunner, Result
 from made_calibrations import made_calibration, written
 from scipy.interpolate import RegularGridInterpolator
@@ -217,7 +216,7 @@ def test_what_a_controller_of_the_nominal_arm_is_sent(desk: Desk) -> None:
     shifts = np.array([[float(row[f"d{axis}_mm"]) for axis in "xyz"] for row in rows])
     assert sent - shifts == pytest.approx(desk.places_mm, abs=1e-9)
     assert np.abs(shifts).max() > 0.5
-    nominal = Bench.of(Calibration.load(desk.calibration), None, None, discover()).nominal()
+    nominal = Bench.of(Calibration.load(desk.calibration), None, None, discover()).nominal
     for place, start in zip(sent / 1000, commands, strict=True):
 
         def off(q: np.ndarray, place=place) -> np.ndarray:
@@ -404,7 +403,7 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compensator, C
     """The LRM arm's calibration as a file, the arm as it is, and what its controller takes it for."""
     given = made_calibration(CONFIGS / "lrm_arm" / "arm.yaml")
     path = written(given, tmp_path_factory.mktemp("table") / "calibration.yaml")
-    nominal = Bench.of(Calibration.load(path), None, None, discover()).nominal()
+    nominal = Bench.of(Calibration.load(path), None, None, discover()).nominal
     return path, given.compensator(options=Options(), choice="interpreted"), nominal
 
 
@@ -476,6 +475,6 @@ def test_assessing_needs_no_prediction_of_errors() -> None:
     found = compensator("three")
     targets = found.targets(found.forward(drawn(found, 3))[:, :3, 3])
     bench = Bench.of(calibration("three"), None, None, discover())
-    assessed = run_compensate.assess(bench, found, targets, found.solve(targets))
-    assert assessed.radii is None
-    assert run_compensate.summary(assessed)["radius_95_mm"] is None
+    answer = Answer(bench, found, targets, found.solve(targets))
+    assert answer.radii is None
+    assert answer.summary()["radius_95_mm"] is None

@@ -14,7 +14,7 @@ from armcal.calibration.tool_expression import measured_point
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal.plugins import discover
-from armcal.run.compensate import Bench, commanded
+from armcal.run.compensate import Answer, Bench
 from click.testing import CliRunner, Result
 from made_calibrations import written
 from scipy.spatial.transform import Rotation
@@ -188,11 +188,11 @@ def test_a_controller_of_the_nominal_arm_can_be_sent_poses_of_the_measured_targe
     places, shifts = rows(out, "x_mm y_mm z_mm"), rows(out, "dx_mm dy_mm dz_mm")
     assert places - shifts == pytest.approx(nodes, abs=1e-9)
     bench = Bench.of(lrm, None, None, discover(), "target")
-    real, nominal = bench.compensator(), bench.nominal()
+    real, nominal = bench.compensator(), bench.nominal
     turned = np.repeat(Rotation.from_euler("xyz", [0, 90, 0], degrees=True).as_matrix()[None], len(nodes), axis=0)
     given = real.targets(nodes / 1000, turned, payload=0.0)
     commands = real.follow(given)
-    read = lrm.predict(commanded(real, given, commands))[0]
+    read = lrm.predict(Answer(bench, real, given, commands).dataset)[0]
     assert 1000 * np.stack([read[f"tracker.{axis}"] for axis in "xyz"], axis=1) == pytest.approx(nodes, abs=1e-3)
     assert 1000 * nominal.forward(commands.joint_angles)[:, :3, 3] == pytest.approx(places, abs=1e-3)
     warned = armcal(*asked, "--for", "nominal")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,7 +16,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of, rotation_matrix, rpy_matrices
 from armcal.base.units import DIMENSIONLESS, UNITS, split_suffix
 from armcal.calibration.calibration import Calibration, arm_named
-from armcal.calibration.compensation import Commands, Compensator, Options, Reach, Targets, nominal_arm
+from armcal.calibration.compensation import Commands, Compensator, Options, Reach, Targets, nominal_arm, sent
 from armcal.calibration.inverse import FARTHEST_M
 from armcal.calibration.rigid_chain import turn_between
 from armcal.calibration.tool_expression import (
@@ -153,22 +154,6 @@ def _rotations(path: Path, dataset: Dataset) -> Array | None:
 
 
 @dataclass(frozen=True)
-class Assessed:
-    """Commands, and what is known about them.
-
-    Attributes:
-        nominal_distances: how far from its target the real arm is with the nominal arm's command (N; m); nan where the
-            nominal arm has none.
-        radii: of the ball about the expected place that holds a measurement of it with 95 % (N; m); None if unknown,
-            as for a tool's origin that no measurement judges.
-    """
-
-    commands: Commands  # found
-    nominal_distances: Array
-    radii: Array | None
-
-
-@dataclass(frozen=True)
 class Bench:
     """An arm of a calibration, where it may go and how its commands are chosen."""
 
@@ -216,6 +201,7 @@ class Bench:
         except ValueError as fault:
             raise ConfigError(f"{fault}.", hint="Correct the limits in the plan.") from fault
 
+    @cached_property
     def nominal(self) -> Compensator:
         """The arm as its controller has it."""
         system, nominal = self.calibration.system, self.calibration.nominal
@@ -223,87 +209,89 @@ class Bench:
         return nominal_arm(system.arms[self.arm], nominal, system.environment, replace(self.options, allowed=None), at)
 
 
-def assess(bench: Bench, compensator: Compensator, targets: Targets, commands: Commands) -> Assessed:
-    """What is known about commands that were found."""
-    nominal = bench.nominal()
-    thought = nominal.solve(replace(targets, conditions={}), commands.joint_angles)
-    reached = compensator.stand(thought.joint_angles, targets, commands.approach)
-    away = np.linalg.norm(reached.base_T_tool[:, :3, 3] - targets.positions, axis=1)
-    return Assessed(
-        commands=commands,
-        nominal_distances=np.where(thought.reached & reached.settled, away, np.nan),
-        radii=_radii(bench.calibration, compensator, targets, commands) if bench.is_judged else None,
-    )
+@dataclass(frozen=True)
+class Answer:
+    """Commands for targets, and what is known about them."""
 
+    bench: Bench
+    compensator: Compensator  # that found the commands
+    targets: Targets
+    commands: Commands
 
-def commanded(compensator: Compensator, targets: Targets, commands: Commands) -> Dataset:
-    name, joints = compensator.expression.name, compensator.joints
-    channels: dict[str, Array] = {f"{name}.{joint}": commands.joint_angles[:, i] for i, joint in enumerate(joints)}
-    channels |= {f"{name}.{APPROACH}{joint}": commands.approach[:, i] for i, joint in enumerate(joints)}
-    channels |= dict(zip(LOAD_CHANNELS, targets.acting, strict=True))
-    channels |= targets.conditions
-    return Dataset(tuple(str(i) for i in range(1, len(commands) + 1)), channels)
+    @cached_property
+    def nominal_distances(self) -> Array:
+        """From each target to the real arm with the nominal arm's command (N; m); nan where that has none."""
+        targets, commands = self.targets, self.commands
+        thought = self.bench.nominal.solve(replace(targets, conditions={}), commands.joint_angles)
+        reached = self.compensator.stand(thought.joint_angles, targets, commands.approach)
+        away = np.linalg.norm(reached.base_T_tool[:, :3, 3] - targets.positions, axis=1)
+        return np.where(thought.reached & reached.settled, away, np.nan)
 
+    @cached_property
+    def dataset(self) -> Dataset:
+        """The commands as records, whose ids count them."""
+        name, joints, commands = self.compensator.expression.name, self.compensator.joints, self.commands
+        channels: dict[str, Array] = {f"{name}.{joint}": commands.joint_angles[:, i] for i, joint in enumerate(joints)}
+        channels |= {f"{name}.{APPROACH}{joint}": commands.approach[:, i] for i, joint in enumerate(joints)}
+        channels |= dict(zip(LOAD_CHANNELS, self.targets.acting, strict=True))
+        channels |= self.targets.conditions
+        return Dataset(tuple(str(i) for i in range(1, len(commands) + 1)), channels)
 
-def _radii(calibration: Calibration, compensator: Compensator, targets: Targets, commands: Commands) -> Array | None:
-    """95 % radii of the first position that is measured of this arm alone."""
-    if len(calibration.system.arms) > 1 or not calibration.readable or calibration.record.prediction is None:
-        return None
-    settled = np.flatnonzero(commands.reached)
-    radii = np.full(len(commands), np.nan)
-    if not settled.size:
+    @cached_property
+    def radii(self) -> Array | None:
+        """Of the ball about the expected place that holds a measurement of it with 95 % (N; m).
+
+        Of the first position that is measured of this arm alone. None if unknown, as for a tool's origin that no
+        measurement judges.
+        """
+        calibration, radii = self.bench.calibration, np.full(len(self.commands), np.nan)
+        alone = len(calibration.system.arms) == 1 and calibration.readable and calibration.record.prediction is not None
+        if not (self.bench.is_judged and alone):
+            return None
+        settled = np.flatnonzero(self.commands.reached)
+        if not settled.size:
+            return radii
+        try:
+            plus_minus = calibration.plus_minus(self.dataset.subset(settled))
+        except ArmcalError:  # such as a record without an equilibrium: commands are worth having without radii
+            return None
+        if not plus_minus.radii:
+            return None
+        radii[settled] = next(iter(plus_minus.radii.values()))
         return radii
-    try:
-        plus_minus = calibration.plus_minus(commanded(compensator, targets, commands).subset(settled))
-    except ArmcalError:  # such as a record without an equilibrium: commands are worth having without radii
-        return None
-    if not plus_minus.radii:
-        return None
-    radii[settled] = next(iter(plus_minus.radii.values()))
-    return radii
+
+    def summary(self) -> Mapping[str, float | int | None]:
+        """In mm, over the targets that are reached."""
+        reached = self.commands.reached
+        away = 1000 * self.commands.distances[reached]
+        nominal = 1000 * self.nominal_distances[reached & np.isfinite(self.nominal_distances)]
+        radii = None if self.radii is None else 1000 * self.radii[reached]
+        return {
+            "targets": len(reached),
+            "reached": int(reached.sum()),
+            "error_mm": float(away.mean()) if away.size else None,
+            "largest_error_mm": float(away.max()) if away.size else None,
+            "nominal_error_mm": float(nominal.mean()) if nominal.size else None,
+            "radius_95_mm": float(np.median(radii)) if radii is not None and radii.size else None,
+        }
 
 
-def summary(assessed: Assessed) -> Mapping[str, float | int | None]:
-    """In mm, over the targets that are reached."""
-    reached = assessed.commands.reached
-    away = 1000 * assessed.commands.distances[reached]
-    nominal = 1000 * assessed.nominal_distances[reached & np.isfinite(assessed.nominal_distances)]
-    radii = None if assessed.radii is None else 1000 * assessed.radii[reached]
-    return {
-        "targets": len(reached),
-        "reached": int(reached.sum()),
-        "error_mm": float(away.mean()) if away.size else None,
-        "largest_error_mm": float(away.max()) if away.size else None,
-        "nominal_error_mm": float(nominal.mean()) if nominal.size else None,
-        "radius_95_mm": float(np.median(radii)) if radii is not None and radii.size else None,
-    }
-
-
-def write_commands(
-    path: Path,
-    compensator: Compensator,
-    targets: Targets,
-    given: Dataset,
-    assessed: Assessed,
-    angle_unit: str,
-    sent: Array | None = None,
-) -> None:
+def write_commands(path: Path, answer: Answer, given: Dataset, angle_unit: str, for_nominal: bool = False) -> None:
     """Write commands beside the targets' own ids, angles in ``deg`` or ``rad``; or what a nominal controller is sent.
 
     Loads and surroundings are written where the targets state them, approaches where they are known.
     """
+    compensator, commands = answer.compensator, answer.dataset.channels
     arm, name = compensator.expression.arm, compensator.expression.name
-    commands = commanded(compensator, targets, assessed.commands).channels
     channels = {
         channel: values
         for channel, values in commands.items()
-        if (sent is None and channel.removeprefix(f"{name}.") in compensator.joints)
+        if (not for_nominal and channel.removeprefix(f"{name}.") in compensator.joints)
         or (given.has(channel) if channel in LOAD_CHANNELS else "." not in channel)
-        or (sent is None and APPROACH in channel and values.any())
+        or (not for_nominal and APPROACH in channel and values.any())
     }
     requested = requested_channels({name: arm}, {}, measured=False)
-    first = _counts(compensator, assessed.commands) if sent is None else _corrected(sent, targets)
-    extra = dict([*first, *_columns(compensator, assessed)])
+    extra = dict([*(_corrected(answer) if for_nominal else _counts(answer)), *_columns(answer)])
     # A target file may be a pose file: its commands, in whatever unit, give way to those that were found.
     own = {f"{joint}_{unit}" for joint in compensator.joints for unit in UNITS}
     kept = {column: texts for column, texts in given.extra.items() if column not in extra and column not in own}
@@ -311,7 +299,8 @@ def write_commands(
     write_csv(path, dataset, [c for c in requested if c.channel in channels], {"angle": angle_unit})
 
 
-def _counts(compensator: Compensator, commands: Commands) -> Iterator[Column]:
+def _counts(answer: Answer) -> Iterator[Column]:
+    compensator, commands = answer.compensator, answer.commands
     for i, joint in enumerate(compensator.joints):
         if commands.counts is not None and joint in compensator.expression.servos:
             tick = compensator.expression.servos[joint][1].tick
@@ -319,25 +308,26 @@ def _counts(compensator: Compensator, commands: Commands) -> Iterator[Column]:
             yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
 
 
-def _corrected(sent: Array, targets: Targets) -> Iterator[Column]:
+def _corrected(answer: Answer) -> Iterator[Column]:
     """Poses that a nominal controller is sent, and how far the targets are shifted and turned to these."""
-    yield from _pose("", sent)
-    for axis, shifts in zip("xyz", sent[:, :3, 3].T - targets.positions.T, strict=True):
+    targets, poses = answer.targets, sent(answer.bench.nominal, answer.commands)
+    yield from _pose("", poses)
+    for axis, shifts in zip("xyz", poses[:, :3, 3].T - targets.positions.T, strict=True):
         yield f"d{axis}_mm", _exact(1000 * shifts)
     if targets.rotations is not None:
-        for axis, turns in zip("xyz", turn_between(targets.rotations, sent[:, :3, :3]).T, strict=True):
+        for axis, turns in zip("xyz", turn_between(targets.rotations, poses[:, :3, :3]).T, strict=True):
             yield f"turn_{axis}_rad", _exact(turns)
 
 
-def _columns(compensator: Compensator, assessed: Assessed) -> Iterator[Column]:
-    commands = assessed.commands
+def _columns(answer: Answer) -> Iterator[Column]:
+    compensator, commands = answer.compensator, answer.commands
     yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.reached)
-    yield from _pose("tool_", assessed.commands.base_T_tool)
+    yield from _pose("tool_", commands.base_T_tool)
     yield "error_mm", short_texts(1000 * commands.distances)
     yield "error_deg", short_texts(np.asarray(np.degrees(commands.turns)))
-    if assessed.radii is not None:
-        yield "radius95_mm", short_texts(1000 * assessed.radii)
-    yield "nominal_error_mm", short_texts(1000 * assessed.nominal_distances)
+    if answer.radii is not None:
+        yield "radius95_mm", short_texts(1000 * answer.radii)
+    yield "nominal_error_mm", short_texts(1000 * answer.nominal_distances)
     if commands.moves is not None:
         kinds = [compensator.expression.arm.commanded[joint] for joint in compensator.joints]
         for kind, unit, scale in (("angle", "deg", 180 / np.pi), ("length", "mm", 1000.0)):
