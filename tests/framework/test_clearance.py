@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from armcal.arm import clearance as shapes
 from armcal.arm.clearance import (
-    Capsule,
-    Clearance,
     ClearanceCheck,
     distance,
     joints_of_frames,
@@ -24,6 +22,14 @@ RANDOM = np.random.default_rng(0)
 
 def Point(frame, at=(0, 0, 0)) -> shapes.Point:  # noqa: N802
     return shapes.Point.si(frame=frame, at=_floats(at))
+
+
+def Capsule(start, end, radius) -> shapes.Capsule:  # noqa: N802
+    return shapes.Capsule.si(start=start, end=end, radius=float(radius))
+
+
+def Clearance(parts, rules, forbidden=()) -> shapes.Clearance:  # noqa: N802
+    return shapes.Clearance.si(parts=parts, rules=rules, forbidden=forbidden)
 
 
 def HalfSpace(point, normal) -> shapes.HalfSpace:  # noqa: N802
@@ -116,8 +122,8 @@ def arm(lrm):
     return lrm.experiment().system.arms["arm"]
 
 
-def ball(frame, radius=0.0, at=(0.0, 0.0, 0.0)) -> tuple[Capsule, ...]:
-    return (Capsule(Point(frame, at), Point(frame, at), radius),)
+def ball(frame, radius=0.0, at=(0.0, 0.0, 0.0)) -> tuple[shapes.Ball, ...]:
+    return (shapes.Ball.si(centre=Point(frame, at), radius=float(radius)),)
 
 
 def test_points_ride_on_the_arm_as_its_kinematics_says(lrm, arm) -> None:

@@ -102,6 +102,7 @@ class HalfSpace(Settings):
 Shape = Annotated[Capsule | Ball | Box | HalfSpace, Field(discriminator="type")]
 _ROUND = (Capsule, Ball)
 _TOOL = Point(frame=TOOL_FRAME)
+_AT_TOOL = Ball.si(centre=_TOOL, radius=0.0)
 
 
 class Rule(Settings):
@@ -203,7 +204,7 @@ class ClearanceCheck:
                 margins[row] = np.minimum(margins[row], known[pair] - rule.at_least)
         tool = where[_TOOL]
         for region in self._clearance.forbidden:
-            margins[-1] = np.minimum(margins[-1], distance(Ball(_TOOL, 0.0), region, where))
+            margins[-1] = np.minimum(margins[-1], distance(_AT_TOOL, region, where))
             if isinstance(region, Box):
                 inside = np.all((tool >= region.low) & (tool <= region.high), axis=1)
             else:

@@ -582,11 +582,10 @@ class Finder:
         wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
         for todo in _chunks(lost, wide + 1):
             picks = self._picked(target[:, todo], 0, wide)
-            seeds, begun = self._seeds.at(picks), (solutions.commands, solutions.states)
-            starts = [
-                np.concatenate([own[:, todo, None], some], axis=2) for own, some in zip(begun, seeds, strict=True)
-            ]
-            attempt, _ = self._searched(record, target, todo, *starts, manner=NEAREST)
+            commands, states = self._seeds.at(picks)
+            commands = np.concatenate([solutions.commands[:, todo, None], commands], axis=2)
+            states = np.concatenate([solutions.states[:, todo, None], states], axis=2)
+            attempt, _ = self._searched(record, target, todo, commands, states, NEAREST)
             left = attempt.distances + self.solver.length * attempt.turns
             left = np.where(self._may(attempt.commands), left, np.inf)
             best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
