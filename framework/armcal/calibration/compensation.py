@@ -576,22 +576,22 @@ class Compensator:
             at = at[:, :_POSTURES] if at.size else finder.first(record[:, :1], goal[:, :1]).commands
         else:
             at = self._commanded(start, 1)
-        count, wide, found = len(targets), at.shape[1], list[Solutions]()
+        count, wide, steps = len(targets), at.shape[1], list[Solutions]()
         moves, sides = np.zeros((count, *at.shape)), np.zeros((count, *at.shape))
         side, spoilt = np.zeros_like(at), np.zeros(wide, dtype=int)
         for i in range(count):
             rows = np.full(wide, i)
             if i == 0 and start is None:
-                found.append(finder.onward(record[:, rows], goal[:, rows], at))
+                steps.append(finder.onward(record[:, rows], goal[:, rows], at))
             else:
                 solutions, side = self._next(finder, record[:, rows], goal[:, rows], at, side)
-                found.append(solutions)
+                steps.append(solutions)
                 moves[i], sides[i] = solutions.commands - at, side
-            at = found[-1].commands
-            spoilt += (np.abs(moves[i]).max(axis=0) > _JUMP).astype(int) + ~found[-1].there
+            at = steps[-1].commands
+            spoilt += (np.abs(moves[i]).max(axis=0) > _JUMP).astype(int) + ~steps[-1].there
             kept = np.asarray(spoilt == spoilt.min())
             if not kept.all():
-                found = [candidates.subset(kept) for candidates in found]
+                steps = [candidates.subset(kept) for candidates in steps]
                 sides, moves, at, side = sides[:, :, kept], moves[:, :, kept], at[:, kept], side[:, kept]
                 wide, spoilt = int(kept.sum()), spoilt[kept]
             yield None
@@ -600,7 +600,7 @@ class Compensator:
         record[len(self.joints) : 2 * len(self.joints)] = sides[:, :, best].T
         for first in range(0, count, PART):
             rows = np.arange(first, min(first + PART, count))
-            along = Solutions.joined([found[row].subset(slice(best, best + 1)) for row in rows])
+            along = Solutions.joined([steps[row].subset(slice(best, best + 1)) for row in rows])
             part = self._commands(chosen_of(record, rows), targets.subset(rows), along)
             yield replace(part, moves=moves[rows, :, best])
 

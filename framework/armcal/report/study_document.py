@@ -1,7 +1,5 @@
 """What a study says, as a document: what to conclude, its tables, and a figure."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from armcal.report.document import Code, Document, Figure, Marks, Panel, Part, Section, Table
@@ -120,25 +118,14 @@ def _variants(result: StudyResult) -> Table:
     return Table(words, ("Variant", *names), rows, page_only=("Train 95 %", "RMS", "Max", "Fit", "Turn 95 %"))
 
 
-def _rows(result: StudyResult) -> dict[tuple[str, tuple[str, ...]], list[Cell]]:
-    rows: dict[tuple[str, tuple[str, ...]], list[Cell]] = {}
-    for cell in result.cells:
-        rows.setdefault((cell.variant, cell.trained_at), []).append(cell)
-    return rows
-
-
-def _trained(trained: Sequence[str], result: StudyResult) -> str:
-    if len(trained) == len(result.groups) > _FEW_GROUPS:
-        return "all"
-    return " and ".join(trained) or "nominal"
-
-
 def _cells(result: StudyResult) -> Table:
     """A row for each variant and what it was trained at, errors at each group beside one another."""
     decimals = common_decimals([c.error_mm.mean for c in result.cells], most=3)
-    few, rows = len(result.groups) <= _FEW_GROUPS, []
-    for (variant, trained), cells in _rows(result).items():
-        words = _trained(trained, result)
+    few, rows, together = len(result.groups) <= _FEW_GROUPS, [], dict[tuple[str, tuple[str, ...]], list[Cell]]()
+    for cell in result.cells:
+        together.setdefault((cell.variant, cell.trained_at), []).append(cell)
+    for (variant, trained), cells in together.items():
+        words = "all" if len(trained) == len(result.groups) and not few else " and ".join(trained) or "nominal"
         words += f" ({plural(cells[0].failed_fits, 'fit')} failed)" if cells[0].failed_fits else ""
         figures = [
             fixed(x, digits) + ("*" if trained and not cell.cross_validated else "")
