@@ -19,7 +19,7 @@ from armcal.base.units import DIMENSIONLESS, parse_quantity, readable, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration import accept as accepted
 from armcal.calibration.calibration_file import sealed
-from armcal.calibration.compensation import Compensator, sent
+from armcal.calibration.compensation import Compensator
 from armcal.calibration.convert import (
     Convention,
     ConvertSource,
@@ -41,8 +41,7 @@ from armcal.calibration.exporter import (
     leaves_residual_out,
     request_of,
 )
-from armcal.calibration.intervals import PlusMinus
-from armcal.calibration.recorded_range import beyond_records
+from armcal.calibration.intervals import PlusMinus, beyond_records
 from armcal.calibration.rigid_chain import rigid_chain
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, unwritten, within
 from armcal.config.validate import validate
@@ -55,7 +54,7 @@ from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
 from armcal.plugins import PluginRegistry
 from armcal.report.document import Document
-from armcal.run.compensate import Assessed, Bench, assess, check_units, commanded, short_texts, summary, write_commands
+from armcal.run.compensate import Answer, Bench, check_units, short_texts, write_commands
 
 _MOST_NAMED = 8
 _LAYOUT = "Name columns so, or as the calibration's data did, with commas between them and decimal points."
@@ -256,15 +255,13 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
         )
     start = _start(options["start"], compensator)
     reach = compensator.follow if options["kind"] == "path" else compensator.solve
-    commands = reach(goals, start)
-    assessed = assess(bench, compensator, goals, commands)
-    poses = sent(bench.nominal(), goals, commands) if options["controller"] else None
-    write_commands(out, compensator, goals, given, assessed, angles, poses)
+    answer = Answer(bench, compensator, goals, reach(goals, start))
+    write_commands(out, answer, given, angles, options["controller"] is not None)
     if kept := bench.calibration.record.prediction:
-        reached = commanded(compensator, goals, commands).subset(np.flatnonzero(commands.reached))
+        reached = answer.dataset.subset(np.flatnonzero(answer.commands.reached))
         if text := beyond_records(kept.ranges, reached, {bench.arm: compensator.expression.arm})[1]:
             console.warn(text)
-    _show_commands(console, given, assessed, bench, out)
+    _show_commands(console, given, answer, out)
 
 
 def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
@@ -288,8 +285,8 @@ def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
     return np.array(list(at.values()))
 
 
-def _show_commands(console: Console, given: Dataset, assessed: Assessed, bench: Bench, out: Path) -> None:
-    figures, commands = summary(assessed), assessed.commands
+def _show_commands(console: Console, given: Dataset, answer: Answer, out: Path) -> None:
+    figures, commands, bench = answer.summary(), answer.commands, answer.bench
     missed = [
         {"id": name, "reason": reason, "nearest_mm": 1000 * float(distance) if np.isfinite(distance) else None}
         for name, reason, distance in zip(given.ids, commands.reasons, commands.distances, strict=True)
