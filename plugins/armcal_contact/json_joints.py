@@ -10,6 +10,7 @@ mean nothing.
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -18,8 +19,8 @@ from armcal.arm.joints import unknown_joint
 from armcal.base.settings import Settings
 from armcal.base.units import from_unit, split_suffix, units_of
 from armcal.devices.clock import Clock
-from armcal.devices.line_source import Begin, LineJointStream, SourceName, open_lines
-from armcal.devices.live import JointSample
+from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.live import JointSample, JointStream
 from armcal.errors import ConfigError
 from pydantic import Field, field_validator
 from typing_extensions import override
@@ -27,6 +28,7 @@ from typing_extensions import override
 _DIGITS = "0123456789"
 _MOST_LABELS = 50
 _LONGEST_LABEL = 200
+_MOST_REASONS = 100
 _UNITS = tuple(unit.name for dimension in ("angle", "length") for unit in units_of(dimension))
 
 
@@ -218,15 +220,16 @@ class JsonLinesJointSettings(Settings):
         return name
 
 
-class JsonLinesJoints(LineJointStream):
+class JsonLinesJoints(JointStream):
     """Joint readings as ``json_joint_message`` reads them. See ``armcal.devices.live.JointStream``."""
 
     Settings: ClassVar[type[JsonLinesJointSettings]] = JsonLinesJointSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"source": "udp:0", "unit": "rad"}
 
     def __init__(self, settings: JsonLinesJointSettings) -> None:
-        super().__init__()
         self._settings = settings
+        self._source: LineSource | None = None
+        self._refused: Counter[str] = Counter()
         self._messages: JointMessages | None = None
         self._clock: Clock | None = None
         self._last: float | None = None
@@ -249,6 +252,22 @@ class JsonLinesJoints(LineJointStream):
         samples = (self._read(line, now) for line in self._source.lines())
         return [sample for sample in samples if sample is not None]
 
+    @property
+    @override
+    def refused(self) -> Mapping[str, int]:
+        return dict(self._refused)
+
+    @property
+    @override
+    def ended(self) -> bool:
+        return self._source is None or self._source.ended
+
+    @override
+    def close(self) -> None:
+        if self._source is not None:
+            self._source.close()
+        self._source = None
+
     def _read(self, line: bytes | None, now: float) -> JointSample | None:
         assert self._messages is not None
         if line is not None and not line.strip():
@@ -258,7 +277,9 @@ class JsonLinesJoints(LineJointStream):
             if message.stamp is not None and message.stamp == self._last:
                 raise RefusedLine("its time is that of the line before: the source repeats itself")
         except RefusedLine as fault:
-            self._refuse(str(fault))
+            reason = str(fault)
+            known = reason in self._refused or len(self._refused) < _MOST_REASONS
+            self._refused[reason if known else "other reasons"] += 1
             return None
         self._last = message.stamp
         return JointSample(now, message.stamp, message.angles, message.labels)

@@ -1,21 +1,22 @@
-"""Lines of text as they come: standard input, datagrams, or a file that another program writes. Nothing waits."""
+"""Lines of text as they come: standard input, datagrams, or a file that another program writes.
+
+A source never waits. Its ``lines`` are all that are complete since the last call, without their ends; None stands for
+one that was too long. ``ended`` says whether nothing more will come, and ``close`` may be called twice.
+"""
 
 import os
 import select
 import socket
 import stat
 import sys
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator
-from typing_extensions import override
 
 from armcal.base.config_text import resolve_path
 from armcal.devices.device import DeviceRefusedError
-from armcal.devices.live import JointStream
 from armcal.errors import ConfigError, InputError, Location
 from armcal.io.lines import LOOPBACK, LineCutter, bound, port_of
 
@@ -26,7 +27,6 @@ Begin = Literal["start", "end"]
 
 LONGEST_LINE_BYTES = 64 * 1024
 _CHUNK = 1 << 20
-_MOST_REASONS = 100
 _MOST_AT_ONCE = 16
 """Chunks, or thousands of datagrams, that are taken at once; the rest waits."""
 _BUFFER_BYTES = 4 << 20
@@ -49,23 +49,7 @@ SourceName = Annotated[str, BeforeValidator(_named)]
 """``-``, ``udp:PORT``, or the path of a file."""
 
 
-class LineSource(Protocol):
-    """Where lines come from.
-
-    Attributes:
-        ended: whether nothing more will come.
-    """
-
-    ended: bool
-
-    def lines(self) -> list[bytes | None]:
-        """All that are complete since the last call, without their ends; None for one that was too long."""
-
-    def close(self) -> None:
-        """Let go. May be called twice."""
-
-
-def open_lines(name: str, begin: Begin) -> LineSource:
+def open_lines(name: str, begin: Begin) -> "LineSource":
     """A source by its name.
 
     Raises:
@@ -87,34 +71,6 @@ def open_lines(name: str, begin: Begin) -> LineSource:
     raise _refusal(name, "it is no file that can be read line by line")
 
 
-class LineJointStream(JointStream):
-    """A stream of joint readings that come as lines; those that are passed over are counted by reason."""
-
-    def __init__(self) -> None:
-        self._source: LineSource | None = None
-        self._refused: Counter[str] = Counter()
-
-    @property
-    @override
-    def refused(self) -> Mapping[str, int]:
-        return dict(self._refused)
-
-    @property
-    @override
-    def ended(self) -> bool:
-        return self._source is None or self._source.ended
-
-    @override
-    def close(self) -> None:
-        if self._source is not None:
-            self._source.close()
-        self._source = None
-
-    def _refuse(self, reason: str) -> None:
-        known = reason in self._refused or len(self._refused) < _MOST_REASONS
-        self._refused[reason if known else "other reasons"] += 1
-
-
 def refused_lines_text(refused: Mapping[str, int]) -> str:
     """Why lines were passed over, the commonest reasons in words; empty if none was."""
     if not refused:
@@ -124,14 +80,13 @@ def refused_lines_text(refused: Mapping[str, int]) -> str:
     return f"{sum(refused.values())} lines were passed over: {listed}"
 
 
-class PipeLines(LineSource):
+class PipeLines:
     """Lines of a pipe. A last line without an end is not trusted."""
 
     def __init__(self, descriptor: int, *, owned: bool) -> None:
         self._descriptor, self._owned = descriptor, owned
         self._cutter, self.ended = LineCutter(LONGEST_LINE_BYTES), False
 
-    @override
     def lines(self) -> list[bytes | None]:
         lines: list[bytes | None] = []
         for _ in range(_MOST_AT_ONCE):
@@ -150,14 +105,13 @@ class PipeLines(LineSource):
                 break
         return lines
 
-    @override
     def close(self) -> None:
         if self._owned and not self.ended:
             os.close(self._descriptor)
         self.ended = True
 
 
-class UdpLines(LineSource):
+class UdpLines:
     """Lines of datagrams on a port of this machine; what comes while nobody looks waits in the system's queue."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -172,7 +126,6 @@ class UdpLines(LineSource):
     def port(self) -> int:
         return int(self._socket.getsockname()[1])
 
-    @override
     def lines(self) -> list[bytes | None]:
         lines: list[bytes | None] = []
         for _ in range(1000 * _MOST_AT_ONCE if not self.ended else 0):
@@ -183,13 +136,12 @@ class UdpLines(LineSource):
             lines += [None] if flags & socket.MSG_TRUNC else data.split(b"\n")
         return lines
 
-    @override
     def close(self) -> None:
         self.ended = True
         self._socket.close()
 
 
-class FileLines(LineSource):
+class FileLines:
     """Lines of a file that grows. One that was cut or replaced is read from its start, in a call of its own.
 
     Attributes:
@@ -207,7 +159,6 @@ class FileLines(LineSource):
             start = max(0, size - LONGEST_LINE_BYTES)
             self._position = start + os.pread(self._file.fileno(), size - start, start).rfind(b"\n") + 1
 
-    @override
     def lines(self) -> list[bytes | None]:
         lines: list[bytes | None] = []
         begun = self._position
@@ -223,7 +174,6 @@ class FileLines(LineSource):
             return lines
         return lines
 
-    @override
     def close(self) -> None:
         self._file.close()
 
@@ -239,6 +189,9 @@ class FileLines(LineSource):
         self._position, self._cutter = 0, LineCutter(LONGEST_LINE_BYTES)
         self.renewed += 1
         return True
+
+
+LineSource = PipeLines | UdpLines | FileLines
 
 
 def _refusal(name: str, why: str) -> DeviceRefusedError:

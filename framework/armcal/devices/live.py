@@ -171,11 +171,11 @@ def frames_of(tracker: Tracker) -> list[TrackerFrame]:
 
 def samples_of(stream: JointStream) -> list[JointSample]:
     """All joint readings that came since the last call."""
-    method, samples = stream.samples, stream.samples()
-    with expecting(method, samples, "a list of JointSample(arrived, stamp, angles, labels), of numbers and texts"):
+    samples, expected = stream.samples(), "a list of JointSample(arrived, stamp, angles, labels), of numbers and texts"
+    with expecting(stream.samples, samples, expected):
         samples = list(samples)
         for sample in samples:
-            _check_moments(method, sample.arrived, sample.stamp)
+            _check_moments(stream.samples, sample.arrived, sample.stamp)
             _ = [isnan(angle) for angle in sample.angles.values()], "".join(sample.labels.values())
     return samples
 
