@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import socket
 from pathlib import Path
 
@@ -150,18 +149,6 @@ def test_a_file_is_followed_from_its_end_through_cuts_and_replacements(tmp_path)
     again = opened(path, unit="rad", begin="start")
     append(path, {"j1": 5, "j2": 5})
     assert len(again.samples()) == 1
-
-
-def test_a_pipe_that_has_a_name_may_be_written_again_and_again(tmp_path):
-    path = tmp_path / "pipe"
-    os.mkfifo(path)
-    stream = JsonLinesJoints(JsonLinesJointSettings(source=str(path), unit="rad"))
-    stream.open(Stopped(), CHANNELS)
-    for number in (1, 2):
-        append(path, {"j1": number, "j2": 0})
-        assert [sample.angles["arm.j1"] for sample in stream.samples()] == [number]
-        assert stream.samples() == [] and not stream.ended
-    stream.close()
 
 
 def test_datagrams_and_a_port_that_is_taken(tmp_path):

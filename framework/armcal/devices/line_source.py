@@ -56,19 +56,17 @@ def open_lines(name: str, begin: Begin) -> "LineSource":
         DeviceRefusedError: it is not there, or is taken.
     """
     if name == STANDARD_INPUT:
-        return PipeLines(sys.stdin.fileno(), owned=False)
+        return InputLines()
     if (port := port_of(name)) is not None:
         return UdpLines(LOOPBACK, port)
-    path = Path(name)
+    why = "it is no file that can be read line by line"
     try:
-        kind = path.stat().st_mode
-        if stat.S_ISREG(kind):
-            return FileLines(path, begin)
-        if stat.S_ISFIFO(kind) or stat.S_ISCHR(kind):
-            return PipeLines(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY), owned=True)
+        if stat.S_ISREG(Path(name).stat().st_mode):
+            return FileLines(Path(name), begin)
     except OSError as fault:
-        raise _refusal(name, f"it cannot be read ({fault.strerror or fault})") from fault
-    raise _refusal(name, "it is no file that can be read line by line")
+        why = f"it cannot be read ({fault.strerror or fault})"
+    text, hint = f"{why}, so no joint readings come.", f"Give {KINDS}, that nothing else uses."
+    raise DeviceRefusedError(text, where=Location(name), hint=hint)
 
 
 def refused_lines_text(refused: Mapping[str, int]) -> str:
@@ -80,34 +78,28 @@ def refused_lines_text(refused: Mapping[str, int]) -> str:
     return f"{sum(refused.values())} lines were passed over: {listed}"
 
 
-class PipeLines:
-    """Lines of a pipe. A last line without an end is not trusted."""
+class InputLines:
+    """Lines of standard input. A last line without an end is not trusted."""
 
-    def __init__(self, descriptor: int, *, owned: bool) -> None:
-        self._descriptor, self._owned = descriptor, owned
+    def __init__(self) -> None:
         self._cutter, self.ended = LineCutter(LONGEST_LINE_BYTES), False
 
     def lines(self) -> list[bytes | None]:
         lines: list[bytes | None] = []
         for _ in range(_MOST_AT_ONCE):
-            if self.ended or not select.select([self._descriptor], [], [], 0)[0]:
+            if self.ended or not select.select([sys.stdin.fileno()], [], [], 0)[0]:
                 break
             try:
-                data = os.read(self._descriptor, _CHUNK)
+                data = os.read(sys.stdin.fileno(), _CHUNK)
             except BlockingIOError:
                 break
             except OSError:
                 data = b""
-            # A pipe with a name has an end whenever nobody writes; the next writer may come.
-            self.ended = not data and not self._owned
+            self.ended = not data
             lines += self._cutter.feed(data)
-            if not data:
-                break
         return lines
 
     def close(self) -> None:
-        if self._owned and not self.ended:
-            os.close(self._descriptor)
         self.ended = True
 
 
@@ -191,10 +183,4 @@ class FileLines:
         return True
 
 
-LineSource = PipeLines | UdpLines | FileLines
-
-
-def _refusal(name: str, why: str) -> DeviceRefusedError:
-    return DeviceRefusedError(
-        f"{why}, so no joint readings come.", where=Location(name), hint=f"Give {KINDS}, that nothing else uses."
-    )
+LineSource = InputLines | UdpLines | FileLines

@@ -18,7 +18,7 @@ from armcal.config.servo_file import ServoFile, digest, load_servo_file
 from armcal.config.yaml_source import ConfigSource
 from armcal.devices.device import JointDevice, MeasuringDevice
 from armcal.errors import InputError, Location
-from armcal.io.plain_files import write_whole
+from armcal.io.plain_files import write_whole, writing
 
 _WRONG = ""
 """In the place of the fingerprint of a servo that did not do what was commanded."""
@@ -26,23 +26,14 @@ _WRONG = ""
 
 @dataclass(frozen=True)
 class WiringRecord:
-    """What was checked of servos.
+    """What was checked of servos."""
 
-    Attributes:
-        stated_in: the file that names them; the record lies beside it.
-        digests: by joint: a fingerprint (hex) of all that is stated of its servo.
-    """
-
-    stated_in: Path
-    digests: Mapping[str, str]
+    stated_in: Path  # the file that names them; the record lies beside it
+    digests: Mapping[str, str]  # by joint: a fingerprint (hex) of all that is stated of its servo
 
     @classmethod
     def of_servo_file(cls, path: Path, file: ServoFile | None = None) -> WiringRecord:
-        """Of a servo file, as it stands or as ``file`` has it.
-
-        Raises:
-            ConfigError: it is refused.
-        """
+        """Of a servo file, as it stands or as ``file`` has it; see ``load_servo_file`` for what it raises."""
         known = load_servo_file(path) if file is None else file
         return cls(path, {joint: digest({joint: known.calibrated(joint)}) for joint in known.servos})
 
@@ -77,16 +68,16 @@ class WiringRecord:
 
     def carry_over(self, after: WiringRecord) -> None:
         """What was checked stays so in a file whose numbers armcal itself has changed; see ``note``."""
-        kept = self._entries()
-        same = {joint: entry for joint, entry in kept.items() if self._is_of(entry, joint)}
-        if same:
-            self._write({**kept, **{joint: {**same[joint], "servo": after.digests[joint]} for joint in same}})
+        entries = self._entries()
+        checked = [joint for joint in self.digests if self._state(entries, joint) == ""]
+        if checked:
+            self._write({**entries, **{j: {**entries[j], "servo": after.digests[j]} for j in checked}})
 
     def forget(self, joints: Iterable[str]) -> None:
         """Joints whose servos were changed by themselves are to be checked again; see ``note``."""
-        kept, gone = self._entries(), {self._key(joint) for joint in joints}
-        if gone & kept.keys():
-            self._write({joint: entry for joint, entry in kept.items() if joint not in gone})
+        entries, gone = self._entries(), {self._key(joint) for joint in joints}
+        if gone & entries.keys():
+            self._write({joint: entry for joint, entry in entries.items() if joint not in gone})
 
     def check(self, joints: Iterable[str], adapter: str = "") -> None:
         """Whether all joints were seen to turn, on this adapter (empty: not known).
@@ -94,22 +85,13 @@ class WiringRecord:
         Raises:
             InputError: one was not, or what is stated of it or the adapter is another one since.
         """
-        checks, why = self._entries(), {}
+        entries, unchecked = self._entries(), dict[str, list[str]]()
         for joint in joints:
-            key = self._key(joint)
-            entry = checks.get(key)
-            if entry is None or key not in self.digests:
-                why[joint] = "never checked"
-            elif entry.get("servo") == _WRONG:
-                why[joint] = "the last check did not find it right"
-            elif not self._is_of(entry, key):
-                why[joint] = "changed since it was checked"
-            elif adapter and adapter != (checked_on := str(entry.get("adapter", ""))):
-                why[joint] = f"checked on {f'the adapter {checked_on}' if checked_on else 'an adapter without an id'}"
-        if not why:
+            if why := self._state(entries, self._key(joint), adapter):
+                unchecked.setdefault(why, []).append(joint)
+        if not unchecked:
             return
-        alike = {reason: ", ".join(joint for joint in why if why[joint] == reason) for reason in why.values()}
-        named = "; ".join(f"{joints_of}: {reason}" for reason, joints_of in alike.items())
+        named = "; ".join(f"{', '.join(names)}: {why}" for why, names in unchecked.items())
         raise InputError(
             f"found servos that were not checked to move their joint ({named}); nothing was moved.",
             where=Location(str(self.stated_in)),
@@ -121,8 +103,17 @@ class WiringRecord:
         """With its arm's name (``arm.q1``) or without."""
         return joint if joint in self.digests else joint.rpartition(".")[2]
 
-    def _is_of(self, entry: Mapping[str, Any], joint: str) -> bool:
-        return joint in self.digests and entry.get("servo") == self.digests[joint]
+    def _state(self, entries: Mapping[str, Any], joint: str, adapter: str = "") -> str:
+        """Why a joint is not checked; empty if it is."""
+        entry, stated = entries.get(joint), self.digests.get(joint)
+        if entry is None or stated is None:
+            return "never checked"
+        if entry.get("servo") != stated:
+            is_wrong = entry.get("servo") == _WRONG
+            return "the last check did not find it right" if is_wrong else "changed since it was checked"
+        if adapter and adapter != (checked_on := str(entry.get("adapter", ""))):
+            return f"checked on {f'the adapter {checked_on}' if checked_on else 'an adapter without an id'}"
+        return ""
 
     def _entries(self) -> dict[str, Any]:
         """By joint; a record that is damaged says nothing, so that its joints are checked again."""
@@ -133,14 +124,8 @@ class WiringRecord:
         return {joint: e for joint, e in content.items() if isinstance(e, dict)} if isinstance(content, dict) else {}
 
     def _write(self, entries: Mapping[str, Any]) -> None:
-        try:
+        with writing(self.path, "Make the folder of that file writable, and check again."):
             write_whole(self.path, (json.dumps(entries, indent=2) + "\n").encode())
-        except OSError as fault:
-            raise InputError(
-                f"it cannot be written ({fault.strerror}), so that what was checked is not known later.",
-                where=Location(str(self.path)),
-                hint="Make the folder of that file writable, and check again.",
-            ) from fault
 
 
 def wiring_of(source: ConfigSource, device: JointDevice) -> WiringRecord | None:
