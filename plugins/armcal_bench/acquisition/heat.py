@@ -10,6 +10,7 @@ from armcal.arm.joints import unknown_joint
 from armcal.arm.statics import Environment
 from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
+from scipy.optimize import brentq
 
 from armcal_bench.acquisition.settings import ServoHeatSettings
 
@@ -40,11 +41,7 @@ class HeatModel:
 
     @classmethod
     def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings], torques: Torques) -> Self:
-        """The model of these joints.
-
-        Raises:
-            ValueError: the settings name no such joint.
-        """
+        """The model of these joints; ValueError where the settings name no such joint."""
         if fault := unknown_joint(settings, joints):
             raise ValueError(fault)
         servos = [settings.get(joint) for joint in joints]
@@ -86,18 +83,13 @@ class HeatModel:
     def cooled_in(self, thermal_state: Array, torque: Array, limits: Array) -> float:
         """Seconds of holding a torque until no heat is above its limit (joints); infinite if it never comes so."""
 
-        def hot(seconds: float) -> bool:
-            return bool(np.any(self.heat(self.after(thermal_state, torque, seconds)) > limits))
+        def excess(seconds: float) -> float:
+            return float(np.max(self.heat(self.after(thermal_state, torque, seconds)) - limits))
 
-        if not hot(0.0):
+        if excess(0.0) <= 0:
             return 0.0
-        low, high = 0.0, _TIMES_OVER * float(self.times.max())
-        if hot(high):
-            return NEVER
-        while high - low > _RESOLUTION_S:
-            middle = (low + high) / 2
-            low, high = (middle, high) if hot(middle) else (low, middle)
-        return high
+        longest = _TIMES_OVER * float(self.times.max())
+        return NEVER if excess(longest) > 0 else float(brentq(excess, 0.0, longest, xtol=1e-6)) + _RESOLUTION_S
 
 
 def holding_torques(arm: Arm, environment: Environment) -> Torques:
@@ -114,20 +106,12 @@ class ThermalLimit(Exception):  # noqa: N818 - no error: the servos are let rest
 
 
 class ThermalState:
-    """How warm the servos are, followed from cold on, or from where another run left it.
-
-    Args:
-        model: of the servos.
-        joints: in the arm's order.
-        clock: the bench's.
-
-    Attributes:
-        warmth: of winding and case (joints x 2).
-    """
+    """How warm the servos are, followed from cold on, or from where another run left it."""
 
     def __init__(self, model: HeatModel, joints: Sequence[str], clock: Clock) -> None:
         self.model, self._joints, self._clock = model, joints, clock
-        self.warmth, self._since = self.model.cold, clock.now()
+        self.warmth = self.model.cold  # of winding and case (joints x 2)
+        self._since = clock.now()
 
     def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
         """From another run's warmth (winding and case, by joint), after which joints stood at angles (rad) for so long.
@@ -149,11 +133,7 @@ class ThermalState:
         return dict(zip(self._joints, self.warmth.tolist(), strict=True))
 
     def check(self) -> None:
-        """Whether the servos are within their budget.
-
-        Raises:
-            ThermalLimit: they are not.
-        """
+        """Raise ThermalLimit where a servo is above its budget."""
         if self.model.over(self.warmth):
             raise ThermalLimit(f"the servo of {self._hottest[0]} has come to its budget")
 

@@ -45,15 +45,11 @@ Next = Measure | Rest | LeaveOut
 
 @dataclass(frozen=True)
 class Scheduler:
-    """Decides from where the arm stands, how warm its servos are, and what is left.
-
-    Attributes:
-        approaches: from which side each joint of a pose is to come (N x joints): 1 from below, -1 from above, 0 either.
-    """
+    """Decides from where the arm stands, how warm its servos are, and what is left."""
 
     poses: Array  # N x joints, rad
     ids: tuple[str, ...]  # of the poses
-    approaches: Array
+    approaches: Array  # from which side each joint is to come (N x joints): 1 from below, -1 from above, 0 either
     park: Array  # where it rests (joints, rad)
     planner: PathPlanner
     model: HeatModel
@@ -62,57 +58,52 @@ class Scheduler:
 
     def next(self, at: Array, thermal_state: Array, left: Sequence[int]) -> Next:
         """What to do now; ``left`` are indices of poses, in the plan's order, at least one."""
-        step = self._measured(at, thermal_state, left[0])
-        return step if isinstance(step, LeaveOut) or self._fits(step) else self._rested(at, thermal_state, left[0])
+        pose = left[0]
+        step = self._measured(at, thermal_state, pose)
+        if isinstance(step, LeaveOut) or self._fits(step):
+            return step
+        path = self.planner.find(at, self.park)
+        if path is None:
+            return LeaveOut(pose, "no clear path to where the arm parks was found")
+        gone, home = self._driven(path, thermal_state)
+        at_rest = self.model.torques(self.park)
+        steady = self.model.steady(at_rest)[:, 0]
+        for part in (COOLED_TO, 0.25, 0.1, 0.02):  # not colder than it has to be: a rest before every pose takes hours
+            limits = np.maximum(part * self.model.budget, 1.02 * steady + 1e-6)
+            seconds = self.model.cooled_in(home, at_rest, limits)
+            if seconds == NEVER:
+                return LeaveOut(pose, f"the servos do not cool enough for pose {self.ids[pose]} where the arm parks")
+            cooled = self.model.after(home, at_rest, seconds)
+            if self._fits(self._measured(self.park, cooled, pose)):
+                return Rest(path, gone + seconds, cooled)
+        return LeaveOut(pose, f"pose {self.ids[pose]} needs more torque than the servos bear, even from cold")
 
     def _measured(self, at: Array, thermal_state: Array, pose: int) -> Measure | LeaveOut:
         path = self.planner.find(at, self.poses[pose])
         if path is None:
             return LeaveOut(pose, f"no clear path to pose {self.ids[pose]} was found")
-        there = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
+        gone, there = self._driven(path, thermal_state)
         after = self.model.after(there, self.model.torques(self.poses[pose]), self.capture)
-        return Measure(pose, path, travel(path) / self.rate + self.capture, np.maximum(there, after))
+        return Measure(pose, path, gone + self.capture, np.maximum(there, after))
 
     def _fits(self, step: Measure | LeaveOut) -> bool:
         """Within the budget there, and on the path to where it rests."""
         if isinstance(step, LeaveOut) or self.model.over(step.thermal_state):
             return False
         back = self.planner.find(step.path[-1], self.park)
-        if back is None:
-            return True
-        home = self.model.after(step.thermal_state, self._effective(back), travel(back) / self.rate)
-        return not self.model.over(home)
+        return back is None or not self.model.over(self._driven(back, step.thermal_state)[1])
 
-    def _rested(self, at: Array, thermal_state: Array, pose: int) -> Rest | LeaveOut:
-        """A rest down to a part of the budget, and on until the pose fits."""
-        path = self.planner.find(at, self.park)
-        if path is None:
-            return LeaveOut(pose, "no clear path to where the arm parks was found")
-        home = self.model.after(thermal_state, self._effective(path), travel(path) / self.rate)
-        at_rest = self.model.torques(self.park)
-        steady = self.model.steady(at_rest)
-        if not self._fits(self._measured(self.park, np.minimum(self.model.cold + steady, thermal_state), pose)):
-            return LeaveOut(pose, f"pose {self.ids[pose]} needs more torque than the servos bear, even from cold")
-        for part in (COOLED_TO, 0.25, 0.1, 0.02):
-            limits = np.maximum(part * self.model.budget, 1.02 * steady[:, 0] + 1e-6)
-            seconds = self.model.cooled_in(home, at_rest, limits)
-            if seconds == NEVER:
-                break
-            cooled = self.model.after(home, at_rest, seconds)
-            if self._fits(self._measured(self.park, cooled, pose)):
-                return Rest(path, travel(path) / self.rate + seconds, cooled)
-        return LeaveOut(pose, f"the servos do not cool enough for pose {self.ids[pose]} where the arm parks")
-
-    def _effective(self, path: JointPath) -> Array:
-        """The torque that heats as the path does on average (joints, N m)."""
+    def _driven(self, path: JointPath, thermal_state: Array) -> tuple[float, Array]:
+        """How long a path takes (s), and how warm it leaves the servos: by the torque that heats as it does on average."""
         squares, lengths, torques = [], [], self.model.torques
         for start, goal in pairwise(path):
             parts = [torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]
             squares.append(np.mean(parts, axis=0))
             lengths.append(float(np.max(np.abs(goal - start))))
-        if not sum(lengths):
-            return torques(path[-1])
-        return np.asarray(np.sqrt(np.average(squares, axis=0, weights=lengths)))
+        if not (length := sum(lengths)):
+            return 0.0, thermal_state
+        effective = np.sqrt(np.average(squares, axis=0, weights=lengths))
+        return length / self.rate, self.model.after(thermal_state, effective, length / self.rate)
 
 
 @dataclass(frozen=True)
@@ -129,18 +120,16 @@ class ScheduleForecast:
 def forecast_schedule(scheduler: Scheduler, at: Array, thermal_state: Array, left: Sequence[int]) -> ScheduleForecast:
     """The whole run, as it will be decided step by step if the servos heat as the model says."""
     steps: list[Next] = []
-    remaining, seconds, gone, resting, hottest = list(left), 0.0, 0.0, 0.0, scheduler.model.heat(thermal_state)
+    remaining, heats = list(left), [scheduler.model.heat(thermal_state)]
     while remaining:
         step = scheduler.next(at, thermal_state, remaining)
         steps.append(step)
-        if isinstance(step, LeaveOut):
+        if not isinstance(step, Rest):
             remaining.remove(step.pose)
-            continue
-        if isinstance(step, Measure):
-            remaining.remove(step.pose)
-        else:
-            resting += step.seconds
-        seconds, gone = seconds + step.seconds, gone + travel(step.path)
-        thermal_state, at = step.thermal_state, step.path[-1]
-        hottest = np.maximum(hottest, scheduler.model.heat(thermal_state))
-    return ScheduleForecast(tuple(steps), seconds, gone, resting, hottest)
+        if not isinstance(step, LeaveOut):
+            thermal_state, at = step.thermal_state, step.path[-1]
+            heats.append(scheduler.model.heat(thermal_state))
+    driven = [step for step in steps if not isinstance(step, LeaveOut)]
+    resting = sum(step.seconds for step in driven if isinstance(step, Rest))
+    gone, seconds = sum(travel(step.path) for step in driven), sum(step.seconds for step in driven)
+    return ScheduleForecast(tuple(steps), seconds, gone, resting, np.max(heats, axis=0))
