@@ -28,15 +28,14 @@ class Settled:
     Attributes:
         deviations: standard deviations of the mean (6): x, y, z in the base frame (m), and the turn about each axis of
             the target (rad). A coordinate that the tracker rounds more coarsely than its noise may have none.
-        begun, ended: when the first and the last of them came, by the bench's clock (s).
     """
 
     base_T_target: Array  # the mean (4 x 4, m); the rotation is NaN where the tracker gives only positions
     deviations: Array
     frames: int  # how many frames it is the mean of
     rejected: int  # how many more were set aside, lying far from the others
-    begun: float
-    ended: float
+    begun: float  # when the first of them came, by the bench's clock (s)
+    ended: float  # and the last
 
     @property
     def record(self) -> dict[str, Any]:
@@ -96,14 +95,9 @@ class Settling:
         left = self._begun + self._settings.wait - start
         if left > _SLACK_S:
             return f"too early: {left:.2f} s to wait"
-        recent = [(frame, again) for frame, again in self._frames if start < frame.arrived <= now]
-        frames = [frame for frame, _ in recent]
-        capture = in_base(frames, self._bodies)
-        faults = [fault or (FROZEN if again else "") for fault, (_, again) in zip(capture.faults, recent, strict=True)]
-        usable = [frame for frame, fault in zip(frames, faults, strict=True) if not fault]
+        usable, poses, faults = self._seen(start, now)
         if why := self._too_few([frame.arrived for frame in usable], faults, start, now):
             return why
-        poses = capture.poses[[not fault for fault in faults]]
         stillness = judged(poses, self._settings.spread)
         if stillness.why_not:
             return stillness.why_not
@@ -118,15 +112,18 @@ class Settling:
 
     def stand(self) -> Stand | None:
         """How the target has moved since the arm was commanded to stand; None where it was hardly seen."""
-        frames = [
-            frame for frame, again in self._frames if frame.arrived > self._begun + self._settings.wait and not again
-        ]
-        capture = in_base(frames, self._bodies)
-        usable = np.array([not fault for fault in capture.faults], dtype=bool)
-        if usable.sum() < max(self._settings.frames, _FEWEST):
+        usable, poses, _ = self._seen(self._begun + self._settings.wait)
+        if len(usable) < max(self._settings.frames, _FEWEST):
             return None
-        times = np.array([frame.arrived for frame in frames])[usable]
-        return drift_of(times, capture.poses[usable])
+        return drift_of(np.array([frame.arrived for frame in usable]), poses)
+
+    def _seen(self, after: float, until: float = np.inf) -> tuple[list[TrackerFrame], Array, list[str]]:
+        """Frames of some time (s) that show the target, its pose in each, and why the others do not."""
+        recent = [(frame, again) for frame, again in self._frames if after < frame.arrived <= until]
+        capture = in_base([frame for frame, _ in recent], self._bodies)
+        faults = [fault or (FROZEN if again else "") for fault, (_, again) in zip(capture.faults, recent, strict=True)]
+        usable = [frame for (frame, _), fault in zip(recent, faults, strict=True) if not fault]
+        return usable, capture.poses[[not fault for fault in faults]], faults
 
     def _too_few(self, times: list[float], faults: list[str], start: float, now: float) -> str:
         """Why the usable frames do not cover the window; empty if they do."""

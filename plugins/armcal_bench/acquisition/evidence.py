@@ -42,14 +42,15 @@ class Arrival:
         if not places:
             return ""
         before, expected = np.array([others[place] for place in places]), self.expected[places]
-        far = _worst(_distances(before, measured) - _distances(expected, self.expected[pose]))
-        turned = _worst(_turns(before, measured) - _turns(expected, self.expected[pose]))
+        (far, angle), (far_here, angle_here) = _apart(before, measured), _apart(expected, self.expected[pose])
+        far, turned = _worst(far - far_here), _worst(angle - angle_here)
         if far <= self.settings.astray and not turned > self.settings.astray_turned:
             return ""
-        angle = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
+        degrees = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
         return (
-            f"the arm is not where it was commanded to be: measured {1000 * far:.0f} mm{angle} off, as seen from other "
-            f"poses (allowed: {1000 * self.settings.astray:.0f} mm, {np.rad2deg(self.settings.astray_turned):.0f} deg)"
+            f"the arm is not where it was commanded to be: measured {1000 * far:.0f} mm{degrees} off, as seen from "
+            f"other poses (allowed: {1000 * self.settings.astray:.0f} mm, "
+            f"{np.rad2deg(self.settings.astray_turned):.0f} deg)"
         )
 
     def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
@@ -61,14 +62,10 @@ class Arrival:
         return frame_mistake(self.expected[poses], np.array([measured[pose] for pose in poses]).reshape(-1, 4, 4))
 
 
-def _distances(poses: Array, pose: Array) -> Array:
-    return np.asarray(np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1))
-
-
-def _turns(poses: Array, pose: Array) -> Array:
-    """By which angle each is turned from one (rad), whatever frames they are given in."""
-    traces = np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3])
-    return np.asarray(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
+def _apart(poses: Array, pose: Array) -> tuple[Array, Array]:
+    """How far each is from one (m), and by which angle it is turned (rad), whatever frames they are given in."""
+    cosines = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
+    return np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1), np.arccos(np.clip(cosines, -1.0, 1.0))
 
 
 def _worst(differences: Array) -> float:
@@ -97,11 +94,10 @@ class Drift:
     @property
     def sentence(self) -> str:
         speed = _MINUTE * 1000 * self.speed
-        amount = f"{speed:.{1 if speed < 10 else 0}f} mm/min"
         return (
-            f"the target moves by {amount} while the arm should stand (in {self.poses} poses): a joint gives way. "
-            "Look at the screws of the horns, at gears and supply; a servo that is too weak for its load gives way as "
-            "well: measure poses in which it carries less"
+            f"the target moves by {speed:.{1 if speed < 10 else 0}f} mm/min while the arm should stand (in "
+            f"{self.poses} poses): a joint gives way. Look at the screws of the horns, at gears and supply; a servo "
+            "that is too weak for its load gives way as well: measure poses in which it carries less"
         )
 
     @property
@@ -125,9 +121,6 @@ class Evidence:
         is_tolerated: whether the run goes on despite a mistake of the tracker's frame; by default it never does.
         fewest: poses that show one.
         restless_ends: whether poses in a row in which the arm does not come to stand end a run, whatever the reason.
-
-    Attributes:
-        doubted: what was recorded of poses that do not count as measured, by their index.
     """
 
     def __init__(
@@ -138,7 +131,7 @@ class Evidence:
         *,
         restless_ends: bool = False,
     ) -> None:
-        self.doubted: dict[int, Mapping[str, Any]] = {}
+        self.doubted: dict[int, Mapping[str, Any]] = {}  # what was recorded of poses that do not count, by their index
         self.arrival, self._is_tolerated = arrival, is_tolerated
         self._fewest, self._restless_ends = fewest, restless_ends
         self._stands: list[tuple[int, Stand]] = []
@@ -156,8 +149,7 @@ class Evidence:
     def failed(self, why: str) -> None:
         """The arm did not come to stand in a pose, or stood elsewhere.
 
-        Raises:
-            JointGivesWay: that happened several times in a row, and the target moves meanwhile.
+        Raises JointGivesWay where that happened several times in a row, and the target moves meanwhile.
         """
         self._failed += 1
         if self._failed < self.arrival.settings.in_a_row:
@@ -173,22 +165,14 @@ class Evidence:
         return Drift.of([stand for _, stand in self._stands[-last:]])
 
     def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
-        """What is wrong with the tracker's units or handedness, by everything that was seen.
-
-        Args:
-            measured: ``base_T_target`` (4 x 4, m) of measured poses, by their index.
-        """
+        """What is wrong with the tracker's units or handedness, by ``base_T_target`` of measured poses and of others."""
         glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
         doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
         seen = {**glimpsed, **measured, **doubted}
         return self.arrival.mistake(seen) if len(seen) >= self._fewest else None
 
     def check_frame(self, measured: Mapping[int, Array]) -> None:
-        """Refuse other units or another frame than expected; see ``mistake``.
-
-        Raises:
-            FrameRefused: they are others.
-        """
+        """Raise FrameRefused where units or frame are other ones than expected; see ``mistake``."""
         mistake = self.mistake(measured)
         if mistake is not None and not self._is_tolerated(mistake):
             raise FrameRefused(f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came")

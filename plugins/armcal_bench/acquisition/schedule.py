@@ -94,7 +94,7 @@ class Scheduler:
         return back is None or not self.model.over(self._driven(back, step.thermal_state)[1])
 
     def _driven(self, path: JointPath, thermal_state: Array) -> tuple[float, Array]:
-        """How long a path takes (s), and how warm it leaves the servos: by the torque that heats as it does on average."""
+        """How long a path takes (s), and how warm it leaves the servos, by the torque that heats like it."""
         squares, lengths, torques = [], [], self.model.torques
         for start, goal in pairwise(path):
             parts = [torques(start + t * (goal - start)) ** 2 for t in (np.arange(_SAMPLES) + 0.5) / _SAMPLES]

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,7 +18,6 @@ from armcal.devices.device import (
     DeviceIdentity,
     DeviceRefusedError,
     DeviceUnwellError,
-    JointDevice,
     open_device,
     state_of,
 )
@@ -29,7 +27,7 @@ from armcal.plugins import blaming
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.evidence import Drift, Evidence, FrameRefused, JointGivesWay
+from armcal_bench.acquisition.evidence import Evidence, FrameRefused, JointGivesWay
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.run_log import (
@@ -62,86 +60,14 @@ WhenStopped = Literal["park", "hold"]
 _TRIES = 2
 _READINGS = 10  # Of servos that know where they stand: their mean is finer than a count
 _AGAIN_EVERY_S = 0.25
+_FIRST_FRAME_S = 3.0
 _MOST_IN_A_ROW = 10
 _LAST_TRIES_S = 2.0  # Somebody who wants the end gets it as it should be, if the device is back within this time
 _AS_IT_IS = "its pulses go on as they are, unless the board parks the arm by itself"
 
 
 class ReconnectError(Exception):
-    """The device does not come back; the message says how long it was tried.
-
-    Attributes:
-        fault: the last one; None where somebody asked for the end meanwhile.
-    """
-
-    def __init__(self, why: str, fault: DeviceError | None) -> None:
-        super().__init__(why)
-        self.fault = fault
-
-
-class Recovery:
-    """Of a device that was opened with an identity; tried for ``longest_s`` at most.
-
-    ``notice`` takes what happens, ``trouble`` or ``back``, and a sentence.
-    """
-
-    def __init__(
-        self,
-        device: JointDevice,
-        identity: DeviceIdentity,
-        gate: MotionGate,
-        longest_s: float,
-        notice: Callable[[str, str], None] = lambda what, sentence: None,
-    ) -> None:
-        self._device, self._identity, self._gate, self._longest = device, identity, gate, longest_s
-        self._notice = notice
-        self._in_a_row, self._since = 0, gate.clock.now()
-
-    def persist(self, action: Callable[[], T], restore: Callable[[], None]) -> T:
-        """Do it; when the device fails, hold until it is open and restored, and do it again.
-
-        Raises:
-            ReconnectError: it does not come back, or fails again at once, time after time.
-            DeviceUnwellError: it works, and the arm is to be parked.
-        """
-        while True:
-            try:
-                result: T = blaming(action)()
-                return result
-            except DeviceUnwellError:
-                raise
-            except DeviceError as fault:
-                self._notice("trouble", str(fault))
-                self._reopen(fault, restore)
-                self._notice("back", "the device is back")
-
-    def _reopen(self, fault: DeviceError, restore: Callable[[], None]) -> None:
-        clock, waits = self._gate.clock, self._gate.waits
-        began = clock.now()
-        self._in_a_row, self._since = (self._in_a_row if began - self._since <= self._longest else 0) + 1, began
-        if self._in_a_row > _MOST_IN_A_ROW:
-            raise ReconnectError(f"the device failed {self._in_a_row} times in a row ({fault})", fault)
-        while (left := began + self._longest - clock.now()) > 0:
-            why = f"the arm holds, the device is looked for: {fault.message.rstrip('.')}"
-            waits.goes_on("device", why, left, clock.now())
-            if self._gate.asked_to_end() and clock.now() >= began + _LAST_TRIES_S:
-                raise ReconnectError(f"it was asked to stop while the device was lost ({fault})", None)
-            clock.sleep(_AGAIN_EVERY_S)
-            try:
-                reopened, begun = open_device(self._device, clock), self._identity
-                if (reopened.digest, reopened.name) != (begun.digest, begun.name):
-                    text = f"found {reopened.name}, expected {begun.name}, with which the run began."
-                    raise DeviceRefusedError(text, hint="Connect the board that the run began with.")
-                restore()
-                waits.over("device", clock.now())
-                return
-            except DeviceRefusedError as refused:
-                # Another program or another board may hold the port for a while.
-                fault = DeviceError(str(refused))
-            except DeviceError as again:
-                fault = again
-        waits.given_up("device")
-        raise ReconnectError(f"the device did not come back in {self._longest:.0f} s ({fault})", fault)
+    """The device does not come back; the message says how long it was tried."""
 
 
 @dataclass(frozen=True)
@@ -154,17 +80,9 @@ class Ending:
 
 
 class AcquisitionRun:
-    """One run over one plan, from its progress on.
+    """One run over one plan, from its progress on, with a device that was opened with an identity.
 
-    Args:
-        drive: the arm.
-        identity: of the device, with which the run began.
-        scheduler: decides what comes next.
-        gate: asked between two steps of the arm.
-        log: the journal, in which every step is written as it is made.
-        evidence: of what is wrong with the tracker's frame, or with the arm.
-        on_progress: called after each pose.
-        when_stopped: what the arm does when somebody asks for the end.
+    ``when_stopped`` is what the arm does when somebody asks for the end.
     """
 
     def __init__(
@@ -179,12 +97,12 @@ class AcquisitionRun:
         when_stopped: WhenStopped = "park",
     ) -> None:
         self._when_stopped = when_stopped
-        self._drive, self._scheduler, self._gate = drive, scheduler, gate
-        self._recovery = Recovery(drive.device, identity, gate, drive.settings.lost.park, self._notice)
+        self._drive, self._identity, self._scheduler, self._gate = drive, identity, scheduler, gate
         self._log, self._evidence, self._on_progress = log, evidence, on_progress
         self._ids, self._settings = scheduler.ids, drive.settings
         self._tries: dict[int, int] = {}
         self._astray = 0
+        self._lost_in_a_row, self._lost_at = 0, gate.clock.now()
         done = {*log.progress.measured, *log.progress.left_out}
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
@@ -218,9 +136,52 @@ class AcquisitionRun:
     def _energise(self) -> None:
         self._drive.energise(self._log.progress.angles)
 
-    def _persist(self, action: Callable[[], T], afterwards: Callable[[], None] | None = None) -> T:
-        """Do it; when the device fails, hold until it is back and energised (or ``afterwards``), and do it again."""
-        return self._recovery.persist(action, afterwards or self._energise)
+    def _persist(self, action: Callable[[], T], restore: Callable[[], None] | None = None) -> T:
+        """Do it; when the device fails, hold until it is back and energised (or ``restore``), and do it again.
+
+        Raises:
+            ReconnectError: it does not come back, or fails again at once, time after time.
+            DeviceUnwellError: it works, and the arm is to be parked.
+        """
+        while True:
+            try:
+                result: T = blaming(action)()
+                return result
+            except DeviceUnwellError:
+                raise
+            except DeviceError as fault:
+                self._notice("trouble", str(fault))
+                self._reopen(fault, restore or self._energise)
+                self._notice("back", "the device is back")
+
+    def _reopen(self, fault: DeviceError, restore: Callable[[], None]) -> None:
+        clock, waits, longest = self._gate.clock, self._gate.waits, self._settings.lost.park
+        began = clock.now()
+        self._lost_in_a_row = (self._lost_in_a_row if began - self._lost_at <= longest else 0) + 1
+        self._lost_at = began
+        if self._lost_in_a_row > _MOST_IN_A_ROW:
+            raise ReconnectError(f"the device failed {self._lost_in_a_row} times in a row ({fault})")
+        while (left := began + longest - clock.now()) > 0:
+            why = f"the arm holds, the device is looked for: {fault.message.rstrip('.')}"
+            waits.goes_on("device", why, left, clock.now())
+            if self._gate.asked_to_end() and clock.now() >= began + _LAST_TRIES_S:
+                raise ReconnectError(f"it was asked to stop while the device was lost ({fault})")
+            clock.sleep(_AGAIN_EVERY_S)
+            try:
+                reopened, begun = open_device(self._drive.device, clock), self._identity
+                if (reopened.digest, reopened.name) != (begun.digest, begun.name):
+                    text = f"found {reopened.name}, expected {begun.name}, with which the run began."
+                    raise DeviceRefusedError(text, hint="Connect the board that the run began with.")
+                restore()
+                waits.over("device", clock.now())
+                return
+            except DeviceRefusedError as refused:
+                # Another program or another board may hold the port for a while.
+                fault = DeviceError(str(refused))
+            except DeviceError as again:
+                fault = again
+        waits.over("device")
+        raise ReconnectError(f"the device did not come back in {longest:.0f} s ({fault})")
 
     def _step(self) -> None:
         """The next.
@@ -286,7 +247,7 @@ class AcquisitionRun:
         until = self._gate.clock.now() + self._settings.settle.longest
         while self._gate.clock.now() < until:
             self._drive.tick(self._gate.resting)
-            if not self._gate.has_trouble:
+            if not self._gate.monitor or not self._gate.monitor.trouble()[0]:
                 return True
         return False
 
@@ -417,16 +378,12 @@ _SAME = {"plan": "plan", "config": "configuration"}
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is done, and who hears of it.
-
-    Attributes:
-        may_energise: asked once, with what is about to move and what is dangerous in it, before anything does.
-    """
+    """How a run is done, and who hears of it."""
 
     folder: Path  # where everything of it is kept
     start: Start  # ``anew``, or ``resume`` what is there
     asked_to_end: Callable[[], bool]  # whether somebody wants it parked
-    may_energise: Callable[[FirstMotion], bool]
+    may_energise: Callable[[FirstMotion], bool]  # asked once before anything moves, with what is dangerous in it
     on_progress: Callable[[Progress], None]  # called after each pose
     unchecked: bool = False  # drive servos too of which nobody has checked that they move their joint
     waits: Waits = field(default_factory=Waits)  # says what is waited for
@@ -449,69 +406,59 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         DeviceError: the board does not answer at all.
         ArmcalError: the journal cannot be written; the arm was parked.
     """
-    experiment = prepared.bench.experiment
+    experiment, ids = prepared.bench.experiment, prepared.scheduler.ids
     measured_by(experiment)
     header = _header(prepared, plan)
     kept = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
     with prepared.bench.clock() as clock, kept as journal:
-        log = RunLog(journal)
-        progress, identity = log.progress, log.identity
-        _check_frame(prepared, progress, options.folder)
-        is_done = {*progress.measured, *progress.left_out} >= set(prepared.scheduler.ids)
-        drift: Drift | None = None
-        if identity is not None and is_done and progress.ended in ("done", "parked", "failed"):
-            how, why = progress.at_the_end(len(prepared.scheduler.ids))  # nothing needs to be there
+        log, drift = RunLog(journal), None
+        begun = identity = log.identity
+        poses = {i: pose_of(log.progress.measured[name]) for i, name in enumerate(ids) if name in log.progress.measured}
+        if (mistake := prepared.arrival.mistake(poses)) is not None:
+            hint = f"{mistake.mend} Then begin anew with another --out."
+            raise InputError(f"{mistake.sentence}; nothing was moved.", where=Location(str(options.folder)), hint=hint)
+
+        def check(identity: DeviceIdentity) -> None:
+            if begun is not None and begun.digest != identity.digest:
+                raise InputError(
+                    f"the run was begun with another board, or another calibration of it, than {identity.name}.",
+                    hint="Connect the board that the run began with, with the servo file that it began with.",
+                )
+
+        def digests() -> dict[str, str]:
+            return {"board": identity.digest[:16] if identity else "", "config": header["config"][:16]}
+
+        is_done = {*log.progress.measured, *log.progress.left_out} >= set(ids)
+        if identity is not None and is_done and log.progress.ended in ("done", "parked", "failed"):
+            how, why = log.progress.at_the_end(len(ids))  # nothing needs to be there
             ending = Ending(how, "it was done before" if how == "done" else why)
         else:
             try:
-                with opened(prepared, options, clock, partial(_check_board, log)) as (gate, identity):
+                with opened(prepared, options, clock, check) as (gate, identity):
                     log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
                     evidence = Evidence(prepared.arrival)
-                    run = ready_run(prepared, options, log, gate, identity, evidence)
-                    ending, progress, drift = run.run(), log.progress, evidence.drift()
+                    ending = ready_run(prepared, options, log, gate, identity, evidence).run()
+                    drift = evidence.drift()
             except (Exception, SystemExit):
                 if identity is not None:
                     with suppress(Exception):  # the journal holds it, whatever else is broken
-                        write_measured(options.folder, experiment, log.progress, _digests(identity, header))
+                        write_measured(options.folder, experiment, log.progress, digests())
                 raise
+        progress = log.progress
         summary = {
-            **_summary(prepared, ending, progress),
+            "how": ending.how,
+            "why": ending.sentence,
+            "poses": len(prepared.plan),
+            "measured": len(progress.measured),
+            "left_out": dict(progress.left_out),
+            "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+            "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
             "gives_way": None if drift is None else drift.content,
             "board": identity.name,
-            "digests": _digests(identity, header),
+            "digests": digests(),
         }
         write_outputs(options.folder, experiment, progress, summary)
         return Outcome(ending, summary)
-
-
-def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str, Any]:
-    return {
-        "how": ending.how,
-        "why": ending.sentence,
-        "poses": len(prepared.plan),
-        "measured": len(progress.measured),
-        "left_out": dict(progress.left_out),
-        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
-        "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
-    }
-
-
-def _digests(identity: DeviceIdentity, header: Mapping[str, Any]) -> dict[str, str]:
-    return {"board": identity.digest[:16], "config": header["config"][:16]}
-
-
-def _check_frame(prepared: Prepared, progress: Progress, folder: Path) -> None:
-    """Refuse to go on with poses of which it is known that their units or their frame are wrong.
-
-    Raises:
-        InputError: they are.
-    """
-    seen = {
-        i: pose_of(progress.measured[name]) for i, name in enumerate(prepared.plan.ids) if name in progress.measured
-    }
-    if (mistake := prepared.arrival.mistake(seen)) is not None:
-        text = f"{mistake.sentence}; nothing was moved."
-        raise InputError(text, where=Location(str(folder)), hint=f"{mistake.mend} Then begin anew with another --out.")
 
 
 def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
@@ -525,25 +472,12 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
     return {"plan": digest, "config": identity_of({**data, "bench": bench}), "began": time.time()}
 
 
-def _check_board(log: RunLog, identity: DeviceIdentity) -> None:
-    if log.identity is not None and log.identity.digest != identity.digest:
-        raise InputError(
-            f"the run was begun with another board, or another calibration of it, than {identity.name}.",
-            hint="Connect the board that the run began with, with the servo file that it began with.",
-        )
-
-
 @contextmanager
 def opened(
     prepared: Prepared, options: RunOptions, clock: Clock, check: Callable[[DeviceIdentity], None]
 ) -> Iterator[tuple[MotionGate, DeviceIdentity]]:
     """With device and tracker, both alive; nothing moves. ``check`` may refuse a device."""
-    device, monitor = prepared.device, TrackerMonitor(prepared.bench, clock)
-
-    def pause() -> None:
-        clock.sleep(prepared.settings.period)
-        device.keep_alive()
-
+    device, monitor, now = prepared.device, TrackerMonitor(prepared.bench, clock), clock.now
     with closing(monitor, device):
         identity = open_device(device, clock)
         check(identity)
@@ -551,8 +485,15 @@ def opened(
         if wiring is not None and not options.unchecked:
             wiring.check(device.joint_names, identity.adapter)
         monitor.open()
-        hint = "Start it, check its address and the names of its bodies, and let it see them."
-        monitor.await_first_frame(pause, hint)
+        until = now() + _FIRST_FRAME_S
+        while monitor.trouble()[0] and now() < until:
+            clock.sleep(prepared.settings.period)
+            device.keep_alive()
+            monitor.look()
+        if monitor.trouble()[0]:
+            why = f"the tracker gives nothing that could be used ({monitor.trouble()[1]}); nothing was moved."
+            hint = "Start it, check its address and the names of its bodies, and let it see them."
+            raise DeviceRefusedError(why, hint=hint)
         yield MotionGate(monitor, clock, prepared.settings.lost, options.asked_to_end, options.waits), identity
 
 
@@ -564,19 +505,14 @@ def ready_run(
     identity: DeviceIdentity,
     evidence: Evidence,
 ) -> AcquisitionRun:
-    """A run that may energise the arm.
-
-    Raises:
-        InputError: it may not.
-    """
+    """A run that may energise the arm; InputError where it may not."""
     settings, scheduler, progress = prepared.settings, prepared.scheduler, log.progress
     device, clock = prepared.device, gate.clock
     drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)
     scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
-    if progress.thermal_state:  # the warmth that an earlier part of the run has left
-        standing = {**progress.angles, **state_of(device).angles}
-        drive.thermal_state.go_on(progress.thermal_state, standing, clock.wall() - progress.at)
     angles = state_of(device).angles
+    if progress.thermal_state:  # the warmth that an earlier part of the run has left
+        drive.thermal_state.go_on(progress.thermal_state, {**progress.angles, **angles}, clock.wall() - progress.at)
     releases, measured = settings.at_end == "release", drive.measured()
     start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
     if angles:  # no signs of life reach the board while somebody thinks: joints that hold are to stay where they are

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import REPEATED, TrackerFrame, frames_of, refused_by
 
 from armcal_bench.acquisition.settings import LostSettings
@@ -12,19 +11,14 @@ from armcal_bench.bench import Bench, BodySettings, base_fault, repeats, tool_fa
 from armcal_bench.settling import Settled, Settling, Stand
 
 _WELL_S = 0.1  # A tracker whose last frame was usable and came so lately is well
-_FIRST_FRAME_S = 3.0
 _SAID_EVERY_S = 60.0
 
 
 @dataclass
 class Waits:
-    """What is waited for, by kind (``tracker``, ``device``, ``rest``): since when, and when that was said last (s).
+    """What is waited for, by kind (``tracker``, ``device``, ``rest``): since when, and when that was said last (s)."""
 
-    Args:
-        say: takes a sentence.
-    """
-
-    say: Callable[[str], None] = lambda text: None
+    say: Callable[[str], None] = lambda text: None  # takes a sentence
     _since: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def goes_on(self, kind: str, why: str, left_s: float, now: float) -> None:
@@ -38,14 +32,10 @@ class Waits:
             return
         self._since[kind] = since, now
 
-    def given_up(self, kind: str) -> None:
-        """It is waited for no longer, in vain: whoever gives up reports it."""
-        self._since.pop(kind, None)
-
-    def over(self, kind: str, now: float) -> None:
-        """It is waited for no longer; nothing where it was not."""
-        if kind in self._since:
-            since, _ = self._since.pop(kind)
+    def over(self, kind: str, now: float | None = None) -> None:
+        """It is waited for no longer: it came at ``now`` (s), or whoever gives it up reports that."""
+        since, _ = self._since.pop(kind, (None, None))
+        if since is not None and now is not None:
             self.say(f"going on after {duration(now - since)}.")
 
 
@@ -54,13 +44,16 @@ def duration(seconds: float) -> str:
 
 
 class TrackerHealth:
-    """Fed with all frames of a tracker from a moment on (s, by the bench's clock)."""
+    """Fed with all frames of a tracker from a moment on (s, by the bench's clock).
 
-    def __init__(self, bodies: BodySettings, begun: float) -> None:
-        self._bodies = bodies
+    A base body that stands still may be out of sight while the arm moves, for ``longest_s``.
+    """
+
+    def __init__(self, bodies: BodySettings, begun: float, longest_s: float = float("inf")) -> None:
+        self._bodies, self._longest = bodies, longest_s if bodies.base_motion == "still" else 0.0
         self._usable_at = begun
         self._last: TrackerFrame | None = None
-        self._base_seen = False
+        self._base_at: float | None = None  # when the base was seen last
         self._why = ""
         self._refused: Mapping[str, int] = {}
         self._refused_before: Mapping[str, int] = {}
@@ -69,10 +62,14 @@ class TrackerHealth:
         """Take in the frames that came, and what the tracker has refused since it was opened (``Tracker.refused``)."""
         self._refused = dict(refused)
         for frame in frames:
-            unseen, base = tool_fault(frame, self._bodies), base_fault(frame, self._bodies)
-            self._base_seen = self._base_seen or not base
-            if not (self._bodies.base_motion == "still" and self._base_seen):
-                unseen = unseen or base
+            unseen = base_fault(frame, self._bodies)
+            if not unseen:
+                self._base_at = frame.arrived
+            elif self._base_at is not None and frame.arrived - self._base_at < self._longest:
+                unseen = ""
+            elif self._base_at is not None:
+                self._usable_at = min(self._usable_at, self._base_at)
+            unseen = tool_fault(frame, self._bodies) or unseen
             self._why = f"body lost: {unseen}" if unseen else ""
             if not unseen and repeats(frame, self._last, self._bodies):
                 self._why = "frozen: each frame is like the one before"
@@ -100,46 +97,22 @@ class TrackerMonitor:
     """Feeds every frame to what judges whether the arm stands, and to what judges the tracker."""
 
     def __init__(self, bench: Bench, clock: Clock) -> None:
-        self._clock = clock
-        self._tracker = bench.tracker()
-        self._settling = Settling(bench.settings.acquisition.settle, bench.settings.bodies)
-        bodies = bench.settings.bodies
-        self._health = TrackerHealth(bodies, clock.now())
-        self._with_base = TrackerHealth(bodies.model_copy(update={"base_motion": "moving"}), clock.now())
-        self._longest = bench.settings.acquisition.lost.park
+        self._clock, self._tracker, bodies = clock, bench.tracker(), bench.settings.bodies
+        self._settling = Settling(bench.settings.acquisition.settle, bodies)
+        self._health = TrackerHealth(bodies, clock.now(), bench.settings.acquisition.lost.park)
 
     def open(self) -> None:
         """Begin to listen; see ``Tracker.open`` for what it raises."""
         self._tracker.open(self._clock)
 
-    def await_first_frame(self, pause: Callable[[], object], hint: str) -> None:
-        """Wait for a frame that can be used; ``pause`` lets a moment pass, and ``hint`` says what to do without one.
-
-        Raises:
-            DeviceRefusedError: none comes in three seconds.
-        """
-        until = self._clock.now() + _FIRST_FRAME_S
-        while self.trouble()[0] and self._clock.now() < until:
-            pause()
-            self.look()
-        if self.trouble()[0]:
-            raise DeviceRefusedError(
-                f"the tracker gives nothing that could be used ({self.trouble()[1]}); nothing was moved.", hint=hint
-            )
-
     def look(self) -> None:
-        frames, refused = frames_of(self._tracker), refused_by(self._tracker)
-        for health in (self._health, self._with_base):
-            health.feed(frames, refused)
+        frames = frames_of(self._tracker)
+        self._health.feed(frames, refused_by(self._tracker))
         self._settling.feed(frames)
 
     def trouble(self) -> tuple[float, str]:
-        """Seconds since the last frame that could be used, and why there was none since; (0, "") if all is well.
-
-        A base body that stands still may be out of sight while the arm moves, but not for as long as makes it park.
-        """
-        trouble, with_base = (health.trouble(self._clock.now()) for health in (self._health, self._with_base))
-        return with_base if with_base[0] >= self._longest else trouble
+        """See ``TrackerHealth.trouble``."""
+        return self._health.trouble(self._clock.now())
 
     def begin(self) -> None:
         """The arm was commanded to stand just now: frames that have come already were seen before that."""
@@ -159,11 +132,7 @@ class TrackerMonitor:
 
 
 class StopRequested(Exception):  # noqa: N818 - no error: somebody or something wants the run to end
-    """The run is to end before everything is measured. The message says why.
-
-    Attributes:
-        arm: what the arm does then, in words.
-    """
+    """The run is to end before everything is measured. The message says why, ``arm`` what the arm does then."""
 
     def __init__(self, why: str, arm: str = "the arm holds") -> None:
         super().__init__(why)
@@ -193,33 +162,19 @@ class MotionGate:
     waits: Waits = field(default_factory=Waits)  # says what is waited for
 
     def resting(self) -> bool:
-        """Always, for an arm that rests needs no tracker.
-
-        Raises:
-            StopRequested: somebody asked for the end.
-        """
+        """Always, for an arm that rests needs no tracker; raises StopRequested where somebody asked for the end."""
         if self.monitor is not None:
             self.monitor.look()
         if self.asked_to_end():
             raise StopRequested("it was asked to stop")
         return True
 
-    @property
-    def has_trouble(self) -> bool:
-        """Whether the tracker, if one is used, gives nothing of use now."""
-        return self.monitor is not None and self.monitor.trouble()[0] > 0
-
     def measuring(self) -> bool:
-        """Whether the tracker is well.
-
-        Raises:
-            StopRequested: somebody asked for the end.
-            TrackerLost: the tracker stayed away for too long.
-        """
+        """Whether the tracker is well; raises as ``resting``, and TrackerLost where it stayed away for too long."""
         self.resting()
         seconds, why = (0.0, "") if self.monitor is None else self.monitor.trouble()
         if seconds >= self.lost.park:
-            self.waits.given_up("tracker")
+            self.waits.over("tracker")
             raise TrackerLost(f"the tracker has given nothing of use for {seconds:.0f} s: {why}")
         if seconds >= self.lost.hold:
             self.waits.goes_on("tracker", f"the arm holds: {why}", self.lost.park - seconds, self.clock.now())
@@ -229,13 +184,11 @@ class MotionGate:
         return True
 
     def settled(
-        self, tick: Callable[[MayMove], bool], longest_s: float, check_heat: Callable[[], None] = lambda: None
+        self, tick: Callable[[MayMove], bool], longest_s: float, check_heat: Callable[[], None]
     ) -> Settled | str:
         """Where the target stands, once the arm does; why it is not known, if the arm does not come to stand in time.
 
-        Raises:
-            StopRequested: see ``measuring``.
-            ThermalLimit: by ``check_heat``.
+        Raises as ``measuring`` and ``check_heat``.
         """
         now, monitor = self.clock.now, self.monitor
         assert monitor is not None
