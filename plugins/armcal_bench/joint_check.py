@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from armcal_bench.acquisition.drive import PathPlanner
 from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
-from armcal_bench.acquisition.run_log import NoLog, Progress, measured_by
+from armcal_bench.acquisition.run_log import Log, Progress, measured_by
 from armcal_bench.acquisition.session import Ending, opened, ready_run
 from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.bench import SECTION, Bench, closing
@@ -399,7 +399,7 @@ def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conver
         InputError: the board or the tracker is refused, or the tracker gives other units than expected.
         StopRequested: it was stopped before its end.
     """
-    log, options, ids = NoLog(), talk.options(), prepared.scheduler.ids
+    log, options, ids = Log(), talk.options(), prepared.scheduler.ids
     evidence = Evidence(prepared.arrival, lambda mistake: mistake.frame.is_mirrored, 2 * FEWEST)
     with opened(prepared, options, clock, lambda identity: None) as (gate, identity):
         run = ready_run(prepared, options, log, gate, identity, evidence)

@@ -165,7 +165,7 @@ class Evidence:
         return Drift.of([stand for _, stand in self._stands[-last:]])
 
     def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
-        """What is wrong with the tracker's units or handedness, by ``base_T_target`` of measured poses and of others."""
+        """What is wrong with the tracker's units or handedness, by ``base_T_target`` of measured poses and others."""
         glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
         doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
         seen = {**glimpsed, **measured, **doubted}

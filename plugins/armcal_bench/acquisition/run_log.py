@@ -1,12 +1,12 @@
 """The journal of a measuring run, what the run has done by it, and the dataset and summary that are left behind."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -35,18 +35,12 @@ EndedHow = Literal["done", "held", "parked", "refused", "failed"]
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands.
+    """Where a run stands."""
 
-    Attributes:
-        measured: what was written of each pose, by its id, in the order of measuring.
-        angles: the angles that were commanded last (rad, by joint); empty before the first.
-        thermal_state: of winding and case, by joint, when ``angles`` were written.
-    """
-
-    measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # what was written, by pose id, in order
     left_out: Mapping[str, str] = field(default_factory=dict)  # why, by pose id
-    angles: Mapping[str, float] = field(default_factory=dict)
-    thermal_state: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    angles: Mapping[str, float] = field(default_factory=dict)  # commanded last (rad, by joint); empty before the first
+    thermal_state: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of winding and case, with ``angles``
     at: float = 0.0  # unix s of that
     ended: str = ""  # how it ended, if it did: see ``EndedHow``
 
@@ -75,45 +69,27 @@ class Progress:
 
 
 def progress_of(entries: Iterable[Entry]) -> Progress:
-    progress = Progress()
-    for entry in entries:
-        progress = progress.after(entry.kind, entry.content)
-    return progress
+    return reduce(lambda progress, entry: progress.after(entry.kind, entry.content), entries, Progress())
 
 
-class Log(Protocol):
-    """Where a run writes down what it does; see ``RunLog``."""
-
-    progress: Progress
-
-    def record(self, kind: str, content: Mapping[str, Any]) -> None:
-        """An entry that outlasts a power loss."""
-
-    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
-        """The commanded angles (rad)."""
-
-
-class NoLog(Log):
-    """For motions that nobody goes on with."""
+class Log:
+    """Where a run writes down what it does; this one nowhere, for motions that nobody goes on with."""
 
     def __init__(self) -> None:
         self.progress = Progress()
 
-    @override
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
+        """An entry that outlasts a power loss."""
         self.progress = self.progress.after(kind, content)
 
-    @override
     def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
-        pass
+        """The commanded angles (rad); a power loss may take the last of these."""
 
 
 class RunLog(Log):
-    """An open journal.
+    """An open journal; ``identity`` is that of the device that the run began with, None where it did not.
 
-    Attributes:
-        progress: where the run stands by it, now.
-        identity: of the device that the run began with; None where it did not.
+    It raises JournalFullError or JournalFailedError once alone: what comes after that is the way home.
     """
 
     def __init__(self, journal: Journal) -> None:
@@ -125,25 +101,16 @@ class RunLog(Log):
 
     @override
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
-        """Write an entry that outlasts a power loss.
-
-        Raises:
-            JournalFullError, JournalFailedError: it cannot. Only the first time: what comes after that is the way home.
-        """
-        with self._once():
-            self._journal.record(kind, dict(content))
-        self.progress = self.progress.after(kind, content)
+        self._write(self._journal.record, kind, content)
+        super().record(kind, content)
 
     @override
     def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
-        """Write the commanded angles (rad); a power loss may take the last of these. See ``record``."""
-        with self._once():
-            self._journal.note(HERE, {"angles": dict(angles), "warmth": dict(thermal_state), "at": wall})
+        self._write(self._journal.note, HERE, {"angles": dict(angles), "warmth": dict(thermal_state), "at": wall})
 
-    @contextmanager
-    def _once(self) -> Iterator[None]:
+    def _write(self, how: Callable[[str, Any], object], kind: str, content: Mapping[str, Any]) -> None:
         try:
-            yield
+            how(kind, dict(content))
         except (JournalFullError, JournalFailedError):
             if not self._failed:
                 self._failed = True
@@ -151,16 +118,9 @@ class RunLog(Log):
 
 
 def measured_by(experiment: Experiment) -> tuple[str, tuple[str, ...]]:
-    """The measurement (by instance) that a tracker's pose is, and its channels.
-
-    Raises:
-        ConfigError: none of the measurements is a position or a pose, or several are.
-    """
-    candidates = []
-    for name, measurement in experiment.system.measurements.items():
-        channels = tuple(channel.name for channel in measurement.channels())
-        if channels in (_POSITION, (*_POSITION, *_QUATERNION)):
-            candidates.append((name, channels))
+    """The measurement (by instance) that a tracker's pose is, and its channels; ConfigError where it is not one."""
+    named = [(name, tuple(c.name for c in m.channels())) for name, m in experiment.system.measurements.items()]
+    candidates = [pair for pair in named if pair[1] in (_POSITION, (*_POSITION, *_QUATERNION))]
     if len(candidates) != 1:
         names = ", ".join(name for name, _ in candidates) or "none"
         text = f"found {names} among the measurements, expected one tip_position or tip_pose."
@@ -220,10 +180,6 @@ def write_measured(folder: Path, experiment: Experiment, progress: Progress, dig
 
 
 def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summary: Mapping[str, Any]) -> None:
-    """Replace dataset and summary, each whole.
-
-    Raises:
-        DataError: they cannot be written.
-    """
+    """Replace dataset and summary, each whole."""
     write_measured(folder, experiment, progress, summary["digests"])
     write_whole(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())

@@ -213,10 +213,6 @@ class SweepLog(Log):
         line |= {key: content[key] for key in ("position", "rotation", "frames")}
         self._record.append(POSE, {**line, "deviations": deviations})
 
-    @override
-    def note_angles(self, angles: Mapping[str, float], thermal_state: Mapping[str, Any], wall: float) -> None:
-        pass
-
 
 def pose_name(joint: str, counts: int, came: int) -> str:
     return f"{joint} {counts} {'+' if came > 0 else '-'}"

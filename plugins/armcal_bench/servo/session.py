@@ -17,7 +17,7 @@ from armcal.errors import InputError, Location
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.heat import COOLED_TO
-from armcal_bench.acquisition.run_log import NoLog, Progress
+from armcal_bench.acquisition.run_log import Log, Progress
 from armcal_bench.acquisition.session import opened, ready_run
 from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested
 from armcal_bench.bench import closing
@@ -171,7 +171,7 @@ def _directed(
         if record is not None:
             begin(setup, record, identity)
         scheduler = prepared.scheduler
-        drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, NoLog())
+        drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, Log())
         try:
             drive.energise({})
             path = drive.path_home(drive.at)
