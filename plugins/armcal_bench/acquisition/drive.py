@@ -31,23 +31,18 @@ class PathPlanner:
 
     A lazy roadmap: a line is checked only when a shortest path would use it. [Bohlin2000]
 
-    Attributes:
-        meanwhile: called now and then during a search, which may take seconds.
+    Args:
+        check: of clearance; None where nothing is too near.
+        limits: of the joints (joints x 2, rad).
+        known: poses that are worth going through (N x joints).
+        step: how far apart the poses of a line are that are checked (rad, of the joint that turns most).
+        seed: of the poses that are spread.
     """
 
     def __init__(self, check: ClearanceCheck | None, limits: Array, known: Array, step: float, seed: int = 0) -> None:
-        """Take what is too near (None: nothing is), and where the arm may go.
-
-        Args:
-            check: of clearance.
-            limits: of the joints (joints x 2, rad).
-            known: poses that are worth going through (N x joints).
-            step: how far apart the poses of a line are that are checked (rad, of the joint that turns most).
-            seed: of the poses that are spread.
-        """
         self._check, self._limits, self._known, self._step, self._seed = check, limits, known, step, seed
-        self._clear: dict[tuple[bytes, bytes], bool] = {}
-        self.meanwhile: Callable[[], None] = lambda: None
+        self._clear: dict[frozenset[bytes], bool] = {}
+        self.meanwhile: Callable[[], None] = lambda: None  # called during a search, which may take seconds
 
     def allowed(self, pose: Array) -> bool:
         """Whether nothing is too near there (joints, rad)."""
@@ -70,8 +65,7 @@ class PathPlanner:
     def clear(self, start: Array, goal: Array) -> bool:
         if self._check is None:
             return True
-        low, high = sorted((start.tobytes(), goal.tobytes()))
-        key = (low, high)
+        key = frozenset((start.tobytes(), goal.tobytes()))
         if key not in self._clear:
             self.meanwhile()
             self._clear[key] = bool(self._check(self._line(start, goal)).allowed.all())
@@ -155,17 +149,7 @@ _TAKEN_UP_RAD = np.deg2rad(1.5)  # A turn by less may end within the play, on ne
 
 
 class Drive:
-    """An arm that is commanded step by step along paths: between two steps the board hears that the host lives.
-
-    Attributes:
-        device, clock: of the bench.
-        joints: that are moved.
-        period: between two steps (s).
-        thermal_state: of the servos, by the model.
-        settings: rate, period and the park pose, among others.
-        at: the commanded joint angles (joints, rad).
-        approach: the sign of each joint's last motion; 0 before its first, and where that took up no play (joints).
-    """
+    """An arm that is commanded step by step along paths: between two steps the board hears that the host lives."""
 
     def __init__(
         self,
@@ -176,18 +160,18 @@ class Drive:
         heat: HeatModel,
         log: Log,
     ) -> None:
-        self.device, self.clock, self.joints, self.period = device, clock, device.joint_names, settings.period
+        self.device, self.clock, self.joints = device, clock, device.joint_names
         self.thermal_state = ThermalState(heat, device.joint_names, clock)
-        self._alive = self._heated = clock.now()
+        self._alive = self._heated = self._noted = clock.now()
         self._planner, self.settings, self._log = planner, settings, log
         self._rate = float(np.deg2rad(settings.rate_deg_per_s))
-        self._noted = clock.now()
         self.park = np.array([settings.park.get(joint, 0.0) for joint in self.joints])
-        self.at = self.park.copy()
+        self.at = self.park.copy()  # the commanded joint angles (joints, rad)
         self._is_energised = False
+        # The sign of each joint's last motion; 0 before its first, and where that took up no play.
         self.approach = np.zeros(len(self.joints))
+        # How far each has turned since it last turned back (rad, with its sign).
         self._one_way = np.zeros(len(self.joints))
-        """How far each has turned since it last turned back (rad, with its sign)."""
 
     @property
     def angles(self) -> dict[str, float]:
@@ -201,9 +185,8 @@ class Drive:
     def energise(self, known: Mapping[str, float]) -> None:
         """Take up what the device does; joints without pulses get theirs, one by one.
 
-        Args:
-            known: the angles (rad) that were commanded last before this run, where they were written down; other
-                joints get the angle at which they park. What the device measures goes before both.
+        They get the angles (rad) that were commanded last before this run where these are ``known``, else those at
+        which they park. What the device measures goes before both.
         """
         last = self.angles if self._is_energised else {**self.angles, **known}
         self.take_over({**last, **self.measured(), **state_of(self.device).angles})
@@ -219,11 +202,7 @@ class Drive:
         self._guard(self.at)
 
     def standing(self) -> dict[str, float]:
-        """The angles that its pulses ask for (rad), read back.
-
-        Raises:
-            DeviceError: they are not those that were commanded.
-        """
+        """The angles that its pulses ask for (rad), read back; DeviceError where others were commanded."""
         commanded, angles = standing_at(self.device, self.angles), state_of(self.device).angles
         for joint, angle in commanded.items():
             if joint not in angles or abs(angles[joint] - angle) > _SAME_RAD:
@@ -239,9 +218,7 @@ class Drive:
     def go(self, path: Sequence[Array], may_move: MayMove) -> None:
         """Along a path that begins where the arm is: straight lines in joint space, all joints in proportion.
 
-        Raises:
-            StopRequested, ThermalLimit: it stopped on its path; ``at`` says where.
-            DeviceError: the device failed; what was commanded last may have arrived.
+        StopRequested and ThermalLimit stop it on its path; what was commanded before a DeviceError may have arrived.
         """
         for start, goal in pairwise(path):
             self._guard(start)
@@ -272,13 +249,10 @@ class Drive:
         self._guard(path[-1])
 
     def preload_backlash(self, sides: Array, may_move: MayMove) -> None:
-        """Come to the pose from the stated sides: a little away, and back. See ``go`` for what it raises.
+        """Come to the pose from the stated sides (1 from below, -1 from above, 0 as it came): a little away, and back.
 
         A joint that has had no direction since it was energised comes from either side: which side its play lies on is
         not known before. What limits or obstacles do not allow is left out.
-
-        Args:
-            sides: 1 from below, -1 from above, 0 as the path came (joints).
         """
         unknown, here = self.approach == 0, self.at
         wrong = (sides != 0) & (self.approach != sides)
@@ -290,19 +264,14 @@ class Drive:
                 return
 
     def stand(self, seconds: float, may_move: MayMove) -> None:
-        """Hold for some time.
-
-        Raises:
-            StopRequested: by ``may_move``.
-            DeviceError: the device failed.
-        """
+        """Hold for some time."""
         until = self.clock.now() + seconds
         while (left := until - self.clock.now()) > 0:
             self._pause(min(left, _ALIVE_EVERY_S), may_move)
 
     def tick(self, may_move: MayMove) -> bool:
-        """One period of holding; whether the arm may move. See ``stand``."""
-        return self._pause(self.period, may_move)
+        """One period of holding; whether the arm may move."""
+        return self._pause(self.settings.period, may_move)
 
     def _pause(self, seconds: float, may_move: MayMove) -> bool:
         if self.clock.now() - self._noted >= _NOTED_EVERY_S:

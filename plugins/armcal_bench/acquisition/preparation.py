@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from armcal.arm.assembly import Arm
@@ -51,15 +52,48 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     """
     bench = Bench.of(experiment)
     settings, arm, device = bench.settings.acquisition, bench.arm, bench.device()
-    _check_measures(experiment, settings, device)
+    if settings.angles == "measured" and not isinstance(device, MeasuringDevice):
+        text = "found measured, but this device does not know where its servos stand."
+        hint = "Leave angles out: the commanded angles are written."
+        raise ConfigError(text, where=experiment.source.where((*_AT, "angles")), hint=hint)
     space = JointSpace.of(experiment)
     commands = commands_of(read_poses(experiment, plan), space)
     limits = run_limits(experiment, settings, arm)
-    poses = _settable_poses(device, commands.stacked(space.channels).T, limits, plan, commands)
-    park = _settable_park(experiment, settings, device, limits)
-    prepared = of_poses(bench, settings, device, commands, poses, _approaches(commands, space), limits, park)
-    _check_clear(prepared.scheduler.planner, poses, plan, commands)
-    check_park(experiment, prepared.scheduler.planner, prepared.scheduler.model, park, device.joint_names)
+
+    def refuse(row: int, message: str, hint: str, fault: Exception | None = None) -> NoReturn:
+        where = Location(str(plan), row=commands.rows[row] if commands.rows else None)
+        raise DataError(message, where=where, hint=hint) from fault
+
+    poses = []
+    for row, pose in enumerate(commands.stacked(space.channels).T):
+        if (outside := _outside(pose, limits)).any():
+            joint = int(np.argmax(outside))
+            low, high = np.rad2deg(limits[joint])
+            text = f"pose {commands.ids[row]} has {device.joint_names[joint]} at {np.rad2deg(pose[joint]):.1f} deg"
+            hint = "Nothing was moved. Plan anew with these limits, or take the pose out."
+            refuse(row, f"{text}, expected {low:.1f} to {high:.1f}.", hint)
+        try:
+            poses.append(_nearest_settable(device, pose))  # half a count beyond a limit is the board's affair
+        except DeviceRefusedError as fault:
+            refuse(row, fault.message, fault.hint, fault)
+    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
+    if unknown := unknown_joint(settings.park, joints):
+        raise ConfigError(f"{unknown}.", where=where)
+    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
+    if (outside := _outside(park, limits)).any():
+        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
+        raise ConfigError(text, where=where, hint="Choose another pose.")
+    park = _nearest_settable(device, park)
+    # from which side each joint is to come; 0 where the plan does not say
+    sides = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
+    approaches = np.nan_to_num(np.array(sides).T.reshape(len(commands), -1))
+    prepared = of_poses(bench, settings, device, commands, np.array(poses), approaches, limits, park)
+    planner = prepared.scheduler.planner
+    for row, pose in enumerate(poses):
+        if not planner.allowed(pose):
+            hint = "Nothing was moved. Plan anew with this clearance, or take the pose out."
+            refuse(row, f"pose {commands.ids[row]} is too near to something.", hint)
+    check_park(experiment, planner, prepared.scheduler.model, park, joints)
     planned = experiment.settings.plan.limits if experiment.settings.plan else {}
     return replace(prepared, warnings=stated_beyond(experiment, {**planned, **settings.limits}))
 
@@ -101,32 +135,10 @@ def of_poses(
     return Prepared(bench, settings, device, plan, scheduler, arrival, judge, ())
 
 
-def _check_measures(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice) -> None:
-    if settings.angles == "measured" and not isinstance(device, MeasuringDevice):
-        text = "found measured, but this device does not know where its servos stand."
-        hint = "Leave angles out: the commanded angles are written."
-        raise ConfigError(text, where=experiment.source.where((*_AT, "angles")), hint=hint)
-
-
-def _check_clear(planner: PathPlanner, poses: Array, plan: Path, commands: Dataset) -> None:
-    for row, pose in enumerate(poses):
-        if not planner.allowed(pose):
-            text = f"pose {commands.ids[row]} is too near to something."
-            hint = "Nothing was moved. Plan anew with this clearance, or take the pose out."
-            raise DataError(text, where=_row(plan, commands, row), hint=hint)
-
-
-def _approaches(commands: Dataset, space: JointSpace) -> Array:
-    """From which side each joint is to come (N x joints); 0 where the plan does not say."""
-    columns = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
-    return np.nan_to_num(np.array(columns).T.reshape(len(commands), -1))
-
-
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
     """The run's own, else the plan's, else the arm model's (joints x 2, rad).
 
-    Raises:
-        ConfigError: a joint has none, is no joint, or does not turn.
+    ConfigError where a joint has none, is no joint, or does not turn.
     """
     source, plan = experiment.source, experiment.settings.plan
     if sliding := [joint for joint, dimension in arm.commanded.items() if dimension != "angle"]:
@@ -142,18 +154,6 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
         text = f"found no limits of the joint {missing[0]}."
         raise ConfigError(text, where=where, hint=f"Give them: limits: {{{missing[0]}: [-100 deg, 100 deg]}}.")
     return np.array([ends for ends in limits.values() if ends is not None])
-
-
-def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
-    """The angles (joints, rad) that the device can set nearest to the park pose."""
-    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
-    if fault := unknown_joint(settings.park, joints):
-        raise ConfigError(f"{fault}.", where=where)
-    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
-    if (outside := _outside(park, limits)).any():
-        joint = joints[int(np.argmax(outside))]
-        raise ConfigError(f"{joint} would park outside its limits.", where=where, hint="Choose another pose.")
-    return _nearest_settable(device, park)
 
 
 def check_park(
@@ -182,19 +182,16 @@ def _nearest_settable(device: JointDevice, pose: Array) -> Array:
 
 def _last_settable(device: JointDevice, joint: str, inside: float, beyond: float) -> float:
     """The angle (rad) nearest to ``beyond`` that the device has a pulse for, from an angle that it has one for."""
-    try:
-        device.standing({joint: beyond})
-        return beyond
-    except DeviceRefusedError:
-        pass
-    while abs(beyond - inside) > _SLACK:
-        middle = (inside + beyond) / 2
+    angle = beyond
+    while True:
         try:
-            device.standing({joint: middle})
-            inside = middle
+            device.standing({joint: angle})
+            inside = angle
         except DeviceRefusedError:
-            beyond = middle
-    return inside
+            beyond = angle
+        if abs(beyond - inside) <= _SLACK:
+            return inside
+        angle = (inside + beyond) / 2
 
 
 def _outside(pose: Array, limits: Array) -> Mask:
@@ -209,44 +206,14 @@ def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
     return clearance_check(plan.clearance, {arm.name: arm}, experiment.source)
 
 
-def _settable_poses(device: JointDevice, poses: Array, limits: Array, plan: Path, commands: Dataset) -> Array:
-    """The angles (N x joints, rad) that the device can set nearest to poses within the limits.
-
-    Half a count beyond a limit is the board's affair.
-    """
-    settable = []
-    for row, pose in enumerate(poses):
-        if (outside := _outside(pose, limits)).any():
-            joint = int(np.argmax(outside))
-            low, high = np.rad2deg(limits[joint])
-            raise DataError(
-                f"pose {commands.ids[row]} has {device.joint_names[joint]} at {np.rad2deg(pose[joint]):.1f} deg, "
-                f"expected {low:.1f} to {high:.1f}.",
-                where=_row(plan, commands, row),
-                hint="Nothing was moved. Plan anew with these limits, or take the pose out.",
-            )
-        try:
-            settable.append(_nearest_settable(device, pose))
-        except DeviceRefusedError as fault:
-            raise DataError(fault.message, where=_row(plan, commands, row), hint=fault.hint) from fault
-    return np.array(settable)
-
-
-def _row(plan: Path, commands: Dataset, row: int) -> Location:
-    return Location(str(plan), row=commands.rows[row] if commands.rows else None)
-
-
 def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> HeatModel:
-    """The servos' model.
-
-    Raises:
-        ConfigError: the settings name no such joint, or nothing weighs anything.
-    """
+    """The servos' model; ConfigError where the settings name no such joint, or nothing weighs anything."""
+    where = experiment.source.where((*_AT, "heat"))
     if settings.heat and not arm.masses and not experiment.system.environment.payload_mass:
         text = "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything."
         hint = "Give the masses of the links (arms.NAME.links), or leave heat out."
-        raise ConfigError(text, where=experiment.source.where((*_AT, "heat")), hint=hint)
+        raise ConfigError(text, where=where, hint=hint)
     try:
         return HeatModel.of(tuple(arm.commanded), settings.heat, holding_torques(arm, experiment.system.environment))
     except ValueError as fault:
-        raise ConfigError(f"{fault}.", where=experiment.source.where((*_AT, "heat"))) from fault
+        raise ConfigError(f"{fault}.", where=where) from fault
