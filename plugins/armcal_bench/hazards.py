@@ -43,16 +43,14 @@ class FirstMotion:
 
 @dataclass(frozen=True, eq=False)
 class HazardJudge:
-    """Judges an arm's motions before they begin.
-
-    Attributes:
-        torques: of the load on each joint at joint angles (joints, N m); it turns a limp joint the way of its sign.
-    """
+    """Judges an arm's motions before they begin."""
 
     joints: tuple[str, ...]  # in the arm's order
     moved: tuple[str, ...]  # those that have servos
     limits: Array  # of the joints (joints x 2, rad)
-    torques: Torques
+    torques: (
+        Torques  # of the load on each joint at joint angles (joints, N m); it turns a limp joint the way of its sign
+    )
     rest: Array  # where the arm parks, or its base pose (joints, rad)
 
     def first_motion(
@@ -71,11 +69,12 @@ class HazardJudge:
             releases: whether servos are let go where the arm rests.
             measured: joints whose servos know where they stand.
         """
-        free = tuple(joint for joint in self.moved if joint not in standing and joint not in measured)
-        hazards = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
         powered = tuple(joint for joint in self.moved if joint in standing)
-        known = tuple(joint for joint in self.moved if joint not in standing and joint in measured)
-        return FirstMotion(free, powered, tuple(hazard for hazard in hazards if hazard is not None), known)
+        limp = [joint for joint in self.moved if joint not in standing]
+        free = tuple(joint for joint in limp if joint not in measured)
+        hazards = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
+        there = tuple(hazard for hazard in hazards if hazard is not None)
+        return FirstMotion(free, powered, there, tuple(joint for joint in limp if joint in measured))
 
     def _jump(self, free: Sequence[str], first: Mapping[str, float]) -> Hazard | None:
         """A limp joint hangs anywhere: at an end of its range, or as it falls from where the arm rests."""
@@ -97,9 +96,8 @@ class HazardJudge:
 
     def _outside(self, standing: Mapping[str, float]) -> Hazard | None:
         """A joint whose pulses ask for an angle beyond its limits."""
-        rows = [(i, standing[joint]) for i, joint in enumerate(self.joints) if joint in standing]
-        beyond = [(max(self.limits[i, 0] - at, at - self.limits[i, 1]), i, at) for i, at in rows]
-        amount, i, at = max(beyond, default=(0.0, 0, 0.0))
+        rows = [(i, standing[joint], *self.limits[i]) for i, joint in enumerate(self.joints) if joint in standing]
+        amount, i, at = max(((max(low - at, at - high), i, at) for i, at, low, high in rows), default=(0.0, 0, 0.0))
         if amount <= _BEYOND:
             return None
         low, high = np.degrees(self.limits[i])
@@ -115,7 +113,7 @@ class HazardJudge:
         """How far the arm falls from where it rests, once its servos are let go."""
         fallen = self._fallen
         i = int(np.argmax(np.abs(fallen - self.rest)))
-        amount, torque = abs(float(fallen[i] - self.rest[i])), float(self.torques(self.rest)[i])
+        amount, torque = abs(float(fallen[i] - self.rest[i])), abs(float(self.torques(self.rest)[i]))
         if not amount:
             return None
         return Hazard(
@@ -123,7 +121,7 @@ class HazardJudge:
             self.joints[i],
             amount,
             f"when its pulses end, {self.joints[i]} falls by {math.degrees(amount):.1f} deg if its gears let it (from "
-            f"{math.degrees(self.rest[i]):.1f} to {math.degrees(fallen[i]):.1f} deg): it carries {abs(torque):.2f} N m "
+            f"{math.degrees(self.rest[i]):.1f} to {math.degrees(fallen[i]):.1f} deg): it carries {torque:.2f} N m "
             "where the arm rests.",
         )
 

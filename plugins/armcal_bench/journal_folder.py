@@ -42,13 +42,10 @@ def opened_journal(
             hint = "Give another --out, or go on by --resume."
             raise InputError(f"it holds a {noun} already.", where=where, hint=hint)
         for key, name in same.items():
-            begun, now = journal.header.get(key), header[key]
+            begun, now, lists = journal.header.get(key), header[key], ""
             if begun != now:
-                lists = (
-                    f" ({', '.join(begun) or 'none'}, now {', '.join(now) or 'none'})"
-                    if isinstance(begun, list)
-                    else ""
-                )
+                if isinstance(begun, list):
+                    lists = f" ({', '.join(begun) or 'none'}, now {', '.join(now) or 'none'})"
                 hint = f"Give the {name} that it was begun with, or another --out."
                 raise InputError(f"it was begun with another {name}{lists}.", where=where, hint=hint)
         yield journal

@@ -13,7 +13,7 @@ def armcal_register_commands(register: Register) -> None:
     )
     register(
         "rehearse",
-        "armcal_bench.commands.rehearse:rehearse",
+        "armcal_bench.commands.acquire:rehearse",
         "Do what acquire or servo does, against a simulated bench.",
     )
     register(

@@ -1,37 +1,42 @@
-"""``armcal acquire``."""
+"""``armcal acquire``, and ``armcal rehearse``: the commands of a bench against a simulated one."""
 
+import json
+import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 from armcal.cli.common import Console
 from armcal.devices.device import MeasuringDevice
+from armcal.devices.simulated import ACCOUNT, LOG
 from armcal.devices.wiring import wiring_of
 from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError
+from armcal.io.journal import has_journal
 from armcal.io.signals import Signals
 
 from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.run_log import DATASET, Progress
+from armcal_bench.acquisition.run_log import BENCH, DATASET, Progress
 from armcal_bench.acquisition.schedule import LeaveOut, Rest, ScheduleForecast, forecast_schedule
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.acquisition.tracker_monitor import duration
-from armcal_bench.commands.common import (
-    FILE,
-    Question,
-    energise_option,
-    load,
-    on_bench,
-    plan_option,
-    show_hazards,
-    waits,
-    warned,
-)
-from armcal_bench.journal_folder import Start
+from armcal_bench.commands.common import FILE, Question, always, energise_option, load, on_bench, waits, warned
+
+_ANGLE = 180 / math.pi
+_UNITS = {
+    **dict.fromkeys(("limits", "first_pulse", "drop"), (_ANGLE, "deg")),
+    "speed": (_ANGLE, "deg/s"),
+    "clearance": (1e3, "mm"),
+    "pulse": (1e6, "us"),
+    "heat": (1e2, "% of the servo's limit"),
+    "energised_together": (1.0, "s apart"),
+}
+"""Of a simulated bench's account: what its numbers are multiplied by, and the unit that they then have."""
 
 
 @click.command("acquire")
-@plan_option
+@click.option("--plan", required=True, type=FILE, help="The poses to measure: a CSV, as armcal plan writes it.")
 @click.option("--out", type=FILE, help="The folder to keep data and journal in.")
 @click.option("--resume", is_flag=True, help="Go on with the run in that folder.")
 @click.option("--dry-run", is_flag=True, help="Say what the run would take, and open nothing.")
@@ -50,99 +55,148 @@ def acquire_command(
     overrides: tuple[str, ...],
 ) -> None:
     """Drive a plan's poses with the bench of CONFIG, and measure each when the arm stands."""
-    prepared = prepare(load(console, config, overrides), plan)
-    for text in prepared.warnings:
-        console.danger(text)
-    forecast = schedule_forecast(prepared)
+    prepared = _prepared(console, config, plan, overrides)
     if dry_run:
-        _show_dry_run(console, prepared, forecast)
+        _show_dry_run(console, prepared)
         return
     if out is None:
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
-    if not console.json:
-        show_forecast(console, prepared, forecast)
-    outcome = driven(console, prepared, plan, (out, "resume" if resume else "anew"), may_energise, unchecked=unchecked)
-    show_outcome(console, outcome, config, out)
-    sys.exit(exit_code_of(outcome))
+    outcome = _driven(console, prepared, plan, out, may_energise, resume=resume, unchecked=unchecked)
+    sys.exit(_show_outcome(console, outcome, config, out))
 
 
-def exit_code_of(outcome: Outcome) -> int:
-    if outcome.ending.how == "refused":
-        return EXIT_BAD_INPUT
-    if outcome.ending.how == "failed":
-        return EXIT_FAULT
-    if outcome.ending.how != "done":
-        return EXIT_STOPPED
-    return EXIT_INCOMPLETE if outcome.summary["left_out"] or outcome.summary["gives_way"] else EXIT_DONE
+@click.command()
+@click.option("--plan", type=FILE, help="Rehearse armcal acquire: the poses to measure, as armcal plan writes them.")
+@click.option("--servo", "how", type=click.Choice(["tracked", "guided", "check"]), help="Rehearse armcal servo.")
+@click.option("--out", required=True, type=FILE, help="The folder to keep data, journal and the simulated bench in.")
+@click.option("--resume", is_flag=True, help="Go on with the measuring run in that folder.")
+@on_bench
+def rehearse(
+    console: Console,
+    config: Path,
+    plan: Path | None,
+    how: str | None,
+    out: Path,
+    resume: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Do what armcal acquire or armcal servo does, on the simulated bench of CONFIG; report the loads on its arm.
+
+    The servo file stays as it is.
+    """
+    if (plan is None) == (how is None):
+        hint = "Give one of them: a measuring run is rehearsed, or a calibration of servos."
+        raise InputError(f"found {'neither' if plan is None else 'both'} of --plan and --servo.", hint=hint)
+    bench = out / BENCH
+    if not (resume or has_journal(out)):
+        for name in (ACCOUNT, LOG):
+            (bench / name).unlink(missing_ok=True)
+    overrides = (*overrides, f"bench.simulated={bench.absolute()}")
+    if plan is not None:
+        prepared = _prepared(console, config, plan, overrides)
+        outcome = _driven(console, prepared, plan, out, always, resume=resume, unchecked=True)
+        account = outcome.summary["truth"] = _account(bench)
+        code = _show_outcome(console, outcome, config, out)
+    else:
+        from armcal_bench.commands.servo import servo
+
+        given: dict[str, Any] = {"config": config, "overrides": overrides, "may_energise": always, "keep": True}
+        given |= {"as_json": console.json, "quiet": console.quiet, "verbose": console.verbose}
+        given |= {"check": True} if how == "check" else {"out": out, "guided": how == "guided"}
+        code = EXIT_DONE
+        try:
+            click.get_current_context().invoke(servo, **given)
+        except SystemExit as ending:
+            code = int(ending.code or EXIT_DONE)
+        account = _account(bench)
+    if account:
+        _show_account(console, account)
+    sys.exit(EXIT_INCOMPLETE if code == EXIT_DONE and any(account.get("offences", {}).values()) else code)
 
 
-def schedule_forecast(prepared: Prepared) -> ScheduleForecast:
+def _prepared(console: Console, config: Path, plan: Path, overrides: tuple[str, ...]) -> Prepared:
+    prepared = prepare(load(console, config, overrides), plan)
+    for text in prepared.warnings:
+        console.danger(text)
+    return prepared
+
+
+def _forecast(prepared: Prepared) -> ScheduleForecast:
     scheduler = prepared.scheduler
     return forecast_schedule(scheduler, scheduler.park, scheduler.model.cold, list(range(len(scheduler.ids))))
 
 
-def driven(
-    console: Console, prepared: Prepared, plan: Path, to: tuple[Path, Start], question: Question, *, unchecked: bool
+def _driven(
+    console: Console, prepared: Prepared, plan: Path, out: Path, question: Question, *, resume: bool, unchecked: bool
 ) -> Outcome:
+    if not console.json:
+        _show_forecast(console, prepared, _forecast(prepared))
     with Signals() as signals, console.progress() as show:
 
         def on_progress(progress: Progress) -> None:
             show("measuring", (len(progress.measured) + len(progress.left_out)) / len(prepared.plan))
 
-        may_energise = warned(console, question)
-        options = RunOptions(*to, lambda: signals.finish, may_energise, on_progress, unchecked, waits(console))
+        options = RunOptions(
+            out,
+            "resume" if resume else "anew",
+            lambda: signals.finish,
+            warned(console, question),
+            on_progress,
+            unchecked,
+            waits(console),
+        )
         return acquire(prepared, plan, options)
 
 
-def show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
+def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
     """Time, travel and heat, in a few lines."""
     rests = sum(isinstance(step, Rest) for step in forecast.steps)
-    lines = [
+    console.line(
         f"{len(prepared.plan)} poses in about {duration(forecast.seconds)}; the joints turn "
         f"{np.rad2deg(forecast.travel):.0f} deg in all; {rests} rest{'s' * (rests != 1)}, "
         f"{duration(forecast.resting)} together."
-    ]
-    budgets = prepared.scheduler.model.budget
-    servos = zip(prepared.device.joint_names, forecast.hottest, budgets, strict=True)
+    )
+    servos = zip(prepared.device.joint_names, forecast.hottest, prepared.scheduler.model.budget, strict=True)
     if hot := [f"{joint} {100 * heat:.0f} %" for joint, heat, budget in servos if np.isfinite(budget)]:
-        lines.append(f"hottest, of what each servo bears: {', '.join(hot)}.")
-    lines += [f"left out: {step.why}." for step in forecast.steps if isinstance(step, LeaveOut)]
-    for line in lines:
-        console.line(line)
-    for skipped in prepared.plan.set_aside:
-        console.warn(
-            f"row {skipped.row} of the plan, pose {skipped.record_id}, is set aside and not driven: {skipped.reason}"
-        )
+        console.line(f"hottest, of what each servo bears: {', '.join(hot)}.")
+    for step in forecast.steps:
+        if isinstance(step, LeaveOut):
+            console.line(f"left out: {step.why}.")
+    for row in prepared.plan.set_aside:
+        console.warn(f"row {row.row} of the plan, pose {row.record_id}, is set aside and not driven: {row.reason}")
 
 
-def show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) -> None:
-    """How it ended, and what to do next."""
-    console.result(outcome.summary)
+def _show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) -> int:
+    """How it ended, and what to do next; the exit code."""
     summary, ending = outcome.summary, outcome.ending
-    text = f"{ending.how}: {ending.sentence}. {summary['measured']} of {summary['poses']} poses measured."
-    console.line(text)
-    for name, why in summary["left_out"].items():
+    left_out, drift = summary["left_out"], summary["gives_way"]
+    console.result(summary)
+    console.line(f"{ending.how}: {ending.sentence}. {summary['measured']} of {summary['poses']} poses measured.")
+    for name, why in left_out.items():
         console.warn(f"pose {name} was left out: {why}.")
     if ending.how == "refused":
         console.line("Mend that, and begin anew with another --out.")
-        return
-    if (drift := summary["gives_way"]) and "should stand" not in ending.sentence:
+        return EXIT_BAD_INPUT
+    if drift and "should stand" not in ending.sentence:
         console.warn(drift["what"])
-    if ending.how in ("held", "parked") or len(summary["left_out"]) + summary["measured"] < summary["poses"]:
+    if ending.how in ("held", "parked") or len(left_out) + summary["measured"] < summary["poses"]:
         console.line("Go on with --resume.")
-        return
-    if summary["left_out"]:
-        console.warn(
-            f"{len(summary['left_out'])} of {summary['poses']} poses are missing. Mend what is said of them, and "
-            "measure them with another --out."
-        )
-    if summary["measured"]:
-        console.line(f"next: armcal run {config} --data {out / DATASET} --out DIR")
+    else:
+        if left_out:
+            console.warn(
+                f"{len(left_out)} of {summary['poses']} poses are missing. Mend what is said of them, and measure them "
+                "with another --out."
+            )
+        if summary["measured"]:
+            console.line(f"next: armcal run {config} --data {out / DATASET} --out DIR")
+    if ending.how == "done":
+        return EXIT_INCOMPLETE if left_out or drift else EXIT_DONE
+    return EXIT_FAULT if ending.how == "failed" else EXIT_STOPPED
 
 
-def _show_dry_run(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
+def _show_dry_run(console: Console, prepared: Prepared) -> None:
     """What a run would take, and what is dangerous in it, as far as that is known without a device."""
-    joints, unchecked = prepared.device.joint_names, ""
+    joints, unchecked, forecast = prepared.device.joint_names, "", _forecast(prepared)
     measured = joints if isinstance(prepared.device, MeasuringDevice) else ()
     releases = prepared.settings.at_end == "release"
     hazards = prepared.judge.first_motion({}, {}, releases=releases, measured=measured).hazards
@@ -164,9 +218,41 @@ def _show_dry_run(console: Console, prepared: Prepared, forecast: ScheduleForeca
         "unchecked": unchecked,
     }
     console.result(content)
-    show_forecast(console, prepared, forecast)
+    _show_forecast(console, prepared, forecast)
     if console.json:  # the dangers stand in the result
         return
-    show_hazards(console, hazards)
+    for hazard in hazards:
+        console.warn(hazard.sentence)
     if unchecked:
         console.warn(f"armcal acquire would refuse this: {unchecked}")
+
+
+def _account(bench: Path) -> dict[str, Any]:
+    """What the simulated bench wrote of its arm; empty where nothing happened there."""
+    try:
+        account: dict[str, Any] = json.loads((bench / ACCOUNT).read_bytes())
+    except FileNotFoundError:
+        return {}
+    return account
+
+
+def _show_account(console: Console, account: dict[str, Any]) -> None:
+    """What the simulated arm had to bear: how often, and the worst of each kind."""
+    worst = account.get("worst", {})
+
+    def amount(kind: str) -> str:
+        factor, unit = _UNITS.get(kind, (1.0, ""))
+        return f"{worst[kind]['joint'] or 'the arm'} {factor * worst[kind]['value']:.1f} {unit}".rstrip()
+
+    counted = []
+    for kind, count in account.get("offences", {}).items():
+        if count:
+            factor, unit = _UNITS.get(kind, (1.0, ""))
+            limit = f"{factor * worst[kind]['limit']:.1f} {unit}" if kind in worst else ""
+            counted.append(
+                f"{kind} {count} times{f' (worst: {amount(kind)}, where {limit} is the limit)' if limit else ''}"
+            )
+    console.line(f"on the simulated arm's side, unsafe was: {'; '.join(counted) or 'nothing'}.")
+    for kind, what in (("first_pulse", "the largest jump at a first pulse"), ("drop", "the deepest fall when let go")):
+        if kind in worst:
+            console.line(f"{what}: {amount(kind)}.")

@@ -6,7 +6,7 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -17,7 +17,7 @@ from armcal.errors import InputError
 from armcal.run.experiment import Experiment
 
 from armcal_bench.acquisition.tracker_monitor import Waits
-from armcal_bench.hazards import FirstMotion, Hazard
+from armcal_bench.hazards import FirstMotion
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
@@ -89,14 +89,8 @@ def on_bench(command: F) -> F:
     return click.argument("config", type=FILE)(overrides(speaking(queued)))  # type: ignore[return-value]
 
 
-def plan_option(command: F) -> F:
-    text = "The poses to measure: a CSV, as armcal plan writes it."
-    return click.option("--plan", required=True, type=FILE, help=text)(command)
-
-
 def load(console: Console, config: Path, overrides: tuple[str, ...]) -> Experiment:
-    registry = console.registry()
-    return Experiment.load(config, overrides, registry=registry)
+    return Experiment.load(config, overrides, registry=console.registry())
 
 
 def always(motion: FirstMotion) -> bool:
@@ -127,7 +121,8 @@ def warned(console: Console, question: Question) -> Question:
     """The question, after what is dangerous has been named: whoever gave --yes reads it too."""
 
     def warn_and_ask(motion: FirstMotion) -> bool:
-        show_hazards(console, motion.hazards)
+        for hazard in motion.hazards:
+            console.warn(hazard.sentence)
         return question(motion)
 
     return warn_and_ask
@@ -136,11 +131,6 @@ def warned(console: Console, question: Question) -> Question:
 def waits(console: Console) -> Waits:
     """Lines about what is waited for, on standard error: a progress bar alone does not say that."""
     return Waits(lambda text: console.err.print(text, soft_wrap=True))
-
-
-def show_hazards(console: Console, hazards: Iterable[Hazard]) -> None:
-    for hazard in hazards:
-        console.warn(hazard.sentence)
 
 
 def energise_option(command: F) -> F:
