@@ -155,10 +155,12 @@ class NoEvidence:
     def doubt(self, *pose: Any) -> str:
         return ""
 
+    refusal = doubt
+
     def nothing(self, *anything: Any) -> None:
         pass
 
-    stood = succeeded = failed = check_frame = nothing
+    stood = succeeded = failed = nothing
 
 
 class KilledError(BaseException):

@@ -105,14 +105,6 @@ class Drift:
         return {"mm_per_min": _MINUTE * 1000 * self.speed, "poses": self.poses, "what": f"{self.sentence}."}
 
 
-class FrameRefused(StopRequested):
-    """The tracker's units or handedness are not those that are expected."""
-
-
-class JointGivesWay(StopRequested):
-    """The target moves while the arm should stand, pose after pose."""
-
-
 class Evidence:
     """Everything that was measured, of poses that count and of others.
 
@@ -149,16 +141,16 @@ class Evidence:
     def failed(self, why: str) -> None:
         """The arm did not come to stand in a pose, or stood elsewhere.
 
-        Raises JointGivesWay where that happened several times in a row, and the target moves meanwhile.
+        Raises StopRequested where that happened several times in a row, and the target moves meanwhile.
         """
         self._failed += 1
         if self._failed < self.arrival.settings.in_a_row:
             return
         if (drift := self.drift(self._failed)) is not None:
-            raise JointGivesWay(drift.sentence)
+            raise StopRequested(drift.sentence, how="failed")
         if self._restless_ends:
             text = f"the arm did not come to stand {self._failed} times in a row ({why})"
-            raise JointGivesWay(f"{text}: does a servo stall, or let go?")
+            raise StopRequested(f"{text}: does a servo stall, or let go?", how="failed")
 
     def drift(self, last: int = 0) -> Drift | None:
         """A motion of the target in the last so many stands, or in all of them."""
@@ -171,8 +163,9 @@ class Evidence:
         seen = {**glimpsed, **measured, **doubted}
         return self.arrival.mistake(seen) if len(seen) >= self._fewest else None
 
-    def check_frame(self, measured: Mapping[int, Array]) -> None:
-        """Raise FrameRefused where units or frame are other ones than expected; see ``mistake``."""
+    def refusal(self, measured: Mapping[int, Array]) -> str:
+        """Why the run cannot go on with a mistake of units or frame; empty if it can. See ``mistake``."""
         mistake = self.mistake(measured)
-        if mistake is not None and not self._is_tolerated(mistake):
-            raise FrameRefused(f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came")
+        if mistake is None or self._is_tolerated(mistake):
+            return ""
+        return f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came"

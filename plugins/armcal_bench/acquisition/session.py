@@ -27,7 +27,7 @@ from armcal.plugins import blaming
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.evidence import Evidence, FrameRefused, JointGivesWay
+from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.run_log import (
@@ -76,34 +76,28 @@ class Ending:
 
     how: EndedHow
     sentence: str
-    arm: str = "the arm holds"
+    arm: str
 
 
+@dataclass
 class AcquisitionRun:
-    """One run over one plan, from its progress on, with a device that was opened with an identity.
+    """One run over one plan, from its progress on, with a device that was opened with an identity."""
 
-    ``when_stopped`` is what the arm does when somebody asks for the end.
-    """
+    _drive: Drive
+    _identity: DeviceIdentity
+    _scheduler: Scheduler
+    _gate: MotionGate
+    _log: Log
+    _evidence: Evidence
+    _on_progress: Callable[[Progress], None]
+    _when_stopped: WhenStopped = "park"  # what the arm does when somebody asks for the end
 
-    def __init__(
-        self,
-        drive: Drive,
-        identity: DeviceIdentity,
-        scheduler: Scheduler,
-        gate: MotionGate,
-        log: Log,
-        evidence: Evidence,
-        on_progress: Callable[[Progress], None],
-        when_stopped: WhenStopped = "park",
-    ) -> None:
-        self._when_stopped = when_stopped
-        self._drive, self._identity, self._scheduler, self._gate = drive, identity, scheduler, gate
-        self._log, self._evidence, self._on_progress = log, evidence, on_progress
-        self._ids, self._settings = scheduler.ids, drive.settings
+    def __post_init__(self) -> None:
+        self._ids, self._settings, progress = self._scheduler.ids, self._drive.settings, self._log.progress
         self._tries: dict[int, int] = {}
-        self._astray = 0
-        self._lost_in_a_row, self._lost_at = 0, gate.clock.now()
-        done = {*log.progress.measured, *log.progress.left_out}
+        self._astray = self._lost_in_a_row = 0
+        self._lost_at = self._gate.clock.now()
+        done = {*progress.measured, *progress.left_out}
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
     def run(self) -> Ending:
@@ -118,19 +112,20 @@ class AcquisitionRun:
                 while self._left:
                     self._persist(self._step)
                 return self._park_and_end(*self._log.progress.at_the_end(len(self._ids)))
-            except FrameRefused as refusal:
-                return self._park_and_end("refused", str(refusal))
-            except JointGivesWay as fault:
-                return self._park_and_end("failed", str(fault))
             except (StopRequested, DeviceUnwellError) as request:
-                if self._when_stopped == "hold" and self._gate.asked_to_end():
+                how: EndedHow = request.how if isinstance(request, StopRequested) else "parked"
+                if how == "parked" and self._when_stopped == "hold" and self._gate.asked_to_end():
                     return self._hold_and_end(str(request))
-                return self._park_and_end("parked", str(request))
+                return self._park_and_end(how, str(request))
             except ReconnectError as loss:
-                return self._end(Ending("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS))
+                return self._end("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS)
         except Exception as fault:
             # Nothing is known of what went wrong here, but an arm that is left standing heats up.
-            self._park_after(fault)
+            try:
+                self._park_and_end("parked", str(fault))
+            except Exception as again:
+                with suppress(Exception):
+                    self._end("held", f"{fault}; then {again}; {_AS_IT_IS}")
             raise
 
     def _energise(self) -> None:
@@ -184,13 +179,9 @@ class AcquisitionRun:
         raise ReconnectError(f"the device did not come back in {longest:.0f} s ({fault})")
 
     def _step(self) -> None:
-        """The next.
-
-        Raises:
-            StopRequested: nothing is wrong with the pose, but with where the arm stands: no clear path leads away.
-        """
         step = self._scheduler.next(self._drive.at, self._drive.thermal_state.warmth, self._left)
         if isinstance(step, LeaveOut):
+            # Perhaps nothing is wrong with the pose, but with where the arm stands.
             if (trouble := self._drive.trouble) and self._drive.path_home(self._drive.at) is None:
                 raise StopRequested(f"{trouble}: switch its servos off, and move the arm by hand")
             self._leave_out(step.pose, step.why)
@@ -252,12 +243,7 @@ class AcquisitionRun:
         return False
 
     def _accept(self, pose: int, settled: Settled) -> None:
-        """Write down where the arm stands, unless that is not where it was commanded to.
-
-        Raises:
-            DeviceError: its pulses are not those that were commanded.
-            StopRequested: it stood elsewhere several times in a row, or in other units or another frame than expected.
-        """
+        """Write down where the arm stands, unless that is not where it was commanded to."""
         drive = self._drive
         commanded, readings = drive.standing(), [drive.measured() for _ in range(_READINGS)]
         measured = {joint: sum(reading[joint] for reading in readings) / _READINGS for joint in readings[0]}
@@ -291,18 +277,12 @@ class AcquisitionRun:
         self._keep(pose, record)
 
     def _check_frame(self) -> None:
-        """Refuse other units or another frame than expected; poses that seemed astray in it are kept as measured.
-
-        Raises:
-            FrameRefused: they are others.
-        """
-        try:
-            self._evidence.check_frame(self.known)
-        except FrameRefused:
+        """Stop where units or frame are others than expected; poses that seemed astray in it are kept as measured."""
+        if refusal := self._evidence.refusal(self.known):
             for pose, record in self._evidence.doubted.items():
                 if pose in self._left:
                     self._keep(pose, record)
-            raise
+            raise StopRequested(refusal, how="refused")
 
     def _keep(self, pose: int, record: Mapping[str, Any]) -> None:
         self._log.record(entry.MEASURED, record)
@@ -334,26 +314,19 @@ class AcquisitionRun:
         try:
             self._drive.hold()
         except DeviceError:
-            return self._end(Ending("held", f"{why}, while the board was lost", _AS_IT_IS))
-        return self._end(Ending("held", why))
+            return self._end("held", f"{why}, while the board was lost", _AS_IT_IS)
+        return self._end("held", why)
 
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
         """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
             if not self._persist(self._park):
-                return self._end(Ending("held", f"{why}; no clear path to where it parks was found"))
+                return self._end("held", f"{why}; no clear path to where it parks was found")
             if self._settings.at_end == "release":  # a device that comes back must not energise what hangs by then
                 self._persist(self._drive.release, lambda: None)
         except (ReconnectError, DeviceUnwellError) as loss:
-            return self._end(Ending("held", f"{why}; then {loss}; {_AS_IT_IS}", _AS_IT_IS))
-        return self._end(Ending(how, why))
-
-    def _park_after(self, fault: Exception) -> None:
-        try:
-            self._park_and_end("parked", str(fault))
-        except Exception as again:
-            with suppress(Exception):
-                self._end(Ending("held", f"{fault}; then {again}; {_AS_IT_IS}"))
+            return self._end("held", f"{why}; then {loss}; {_AS_IT_IS}", _AS_IT_IS)
+        return self._end(how, why)
 
     def _park(self) -> bool:
         """Whether a clear path to where the arm parks was found, and gone."""
@@ -364,9 +337,9 @@ class AcquisitionRun:
         self._drive.note()
         return True
 
-    def _end(self, ending: Ending) -> Ending:
-        self._log.record(entry.ENDED, {"how": ending.how, "sentence": ending.sentence, **self._here()})
-        return ending
+    def _end(self, how: EndedHow, sentence: str, arm: str = "the arm holds") -> Ending:
+        self._log.record(entry.ENDED, {"how": how, "sentence": sentence, **self._here()})
+        return Ending(how, sentence, arm)
 
     def _notice(self, what: str, sentence: str) -> None:
         self._log.record(entry.NOTICE, {"what": what, "sentence": sentence, "at": self._gate.clock.wall()})

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from armcal.devices.clock import Clock
 from armcal.devices.live import REPEATED, TrackerFrame, frames_of, refused_by
 
+from armcal_bench.acquisition.run_log import EndedHow
 from armcal_bench.acquisition.settings import LostSettings
 from armcal_bench.bench import Bench, BodySettings, base_fault, repeats, tool_fault
 from armcal_bench.settling import Settled, Settling, Stand
@@ -132,11 +133,14 @@ class TrackerMonitor:
 
 
 class StopRequested(Exception):  # noqa: N818 - no error: somebody or something wants the run to end
-    """The run is to end before everything is measured. The message says why, ``arm`` what the arm does then."""
+    """The run is to end before everything is measured.
 
-    def __init__(self, why: str, arm: str = "the arm holds") -> None:
+    The message says why, ``arm`` what the arm does then, and ``how`` how the run ends (see ``EndedHow``).
+    """
+
+    def __init__(self, why: str, arm: str = "the arm holds", how: EndedHow = "parked") -> None:
         super().__init__(why)
-        self.arm = arm
+        self.arm, self.how = arm, how
 
 
 class TrackerLost(StopRequested):
