@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from armcal.devices.device import DeviceIdentity, DeviceLostError, DeviceState
 from armcal_bench.acquisition.run_log import Progress
-from armcal_bench.settling import Settled
+from armcal_bench.acquisition.tracker_monitor import Settled
 
 COUNT_RAD = 0.0093
 

@@ -25,11 +25,10 @@ from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.acquisition.drive import PathPlanner
-from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
 from armcal_bench.acquisition.run_log import Log, Progress, measured_by
 from armcal_bench.acquisition.session import Ending, opened, ready_run
-from armcal_bench.acquisition.tracker_monitor import StopRequested
+from armcal_bench.acquisition.tracker_monitor import Evidence, StopRequested
 from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.measured_frame import FEWEST, FrameMistake
 from armcal_bench.servo.record import BEGUN, POSE

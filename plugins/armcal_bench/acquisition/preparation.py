@@ -18,10 +18,10 @@ from armcal.run.plan import approach_channels
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
 from armcal_bench.acquisition.drive import PathPlanner
-from armcal_bench.acquisition.evidence import Arrival
 from armcal_bench.acquisition.heat import HeatModel, holding_torques
 from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.settings import AcquisitionSettings
+from armcal_bench.acquisition.tracker_monitor import Arrival
 from armcal_bench.bench import Bench
 from armcal_bench.hazards import HazardJudge
 

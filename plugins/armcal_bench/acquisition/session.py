@@ -27,7 +27,6 @@ from armcal.plugins import blaming
 
 from armcal_bench.acquisition import run_log as entry
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.heat import ThermalLimit
 from armcal_bench.acquisition.preparation import Prepared
 from armcal_bench.acquisition.run_log import (
@@ -43,17 +42,19 @@ from armcal_bench.acquisition.run_log import (
 )
 from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
 from armcal_bench.acquisition.tracker_monitor import (
+    Evidence,
     MotionGate,
+    Settled,
     StopRequested,
     TrackerLost,
     TrackerMonitor,
     Waits,
+    pose_of,
     unguarded,
 )
 from armcal_bench.bench import closing
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.journal_folder import Start, opened_journal
-from armcal_bench.settling import Settled, pose_of
 
 T = TypeVar("T")
 WhenStopped = Literal["park", "hold"]

@@ -1,15 +1,160 @@
-"""The bench's tracker while an arm is measured: whether it is well, where the arm stands, and whether it may go on."""
+"""What the bench's tracker says: whether it is well, whether and where the arm stands, whether it may go on."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
+from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 from armcal.devices.live import REPEATED, TrackerFrame, frames_of, refused_by
+from armcal.measure.rests import deviations_of_mean, judged, mean_pose
 
 from armcal_bench.acquisition.run_log import EndedHow
-from armcal_bench.acquisition.settings import LostSettings
-from armcal_bench.bench import Bench, BodySettings, base_fault, repeats, tool_fault
-from armcal_bench.settling import Settled, Settling, Stand
+from armcal_bench.acquisition.settings import ArrivalSettings, LostSettings, SettleSettings
+from armcal_bench.bench import Bench, BodySettings, base_fault, in_base, repeats, tool_fault
+from armcal_bench.measured_frame import FEWEST, FrameMistake, frame_mistake
+
+FROZEN = "the tracker is frozen: it gives the same frame again"
+_MOST_FRAMES = 20_000
+_GAP = 0.25  # A part of the window that may pass without a usable frame
+_SLACK_S = 1e-9
+_LONGEST_STAND_S, _FEWEST = 30.0, 4
+_LEAST_RATE = 1e-7  # m/s: what is rounded more coarsely than its noise has no deviation
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Where the arm stands.
+
+    Attributes:
+        deviations: standard deviations of the mean (6): x, y, z in the base frame (m), and the turn about each axis of
+            the target (rad). A coordinate that the tracker rounds more coarsely than its noise may have none.
+    """
+
+    base_T_target: Array  # the mean (4 x 4, m); the rotation is NaN where the tracker gives only positions
+    deviations: Array
+    frames: int  # how many frames it is the mean of
+    rejected: int  # how many more were set aside, lying far from the others
+    begun: float  # when the first of them came, by the bench's clock (s)
+    ended: float  # and the last
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Where it stands, to be written down; see ``pose_of``."""
+        rotation, position = self.base_T_target[:3, :3], self.base_T_target[:3, 3]
+        return {"position": position.tolist(), "rotation": None if np.isnan(rotation).any() else rotation.tolist()}
+
+
+@dataclass(frozen=True)
+class Stand:
+    """How the target moved while the arm was commanded to stand."""
+
+    base_T_target: Array  # in the middle of that time (4 x 4, m); the rotation is NaN where it is not known
+    rates: Array  # along x, y, z of the base frame (m/s)
+    sds: Array  # standard deviations of these
+
+
+def pose_of(record: Mapping[str, Any]) -> Array:
+    """What was written of a pose (4 x 4, m); NaN for a rotation that is not known."""
+    pose = np.eye(4)
+    pose[:3, 3] = record["position"]
+    pose[:3, :3] = np.nan if record["rotation"] is None else record["rotation"]
+    return pose
+
+
+class Settling:
+    """Judges by frames whether the arm stands. See ``armcal.measure.rests.judged`` for what that means."""
+
+    def __init__(self, settings: SettleSettings, bodies: BodySettings) -> None:
+        self._settings = settings
+        self._bodies = bodies
+        # base_T_target of a base body that stands still scatters as if it moved: its noise is in the mean as well
+        self._scattered = bodies.model_copy(update={"base_motion": "moving"})
+        self._frames: deque[tuple[TrackerFrame, bool]] = deque(maxlen=_MOST_FRAMES)
+        self._last: TrackerFrame | None = None
+        self._begun = -np.inf
+
+    def begin(self, now: float) -> None:
+        """The arm was commanded to stand just now (s, by the bench's clock): what came before does not count."""
+        self._begun = now
+        self._frames.clear()
+
+    def feed(self, frames: Iterable[TrackerFrame]) -> None:
+        for frame in frames:
+            self._frames.append((frame, repeats(frame, self._last, self._bodies)))
+            self._last = frame
+        last = self._frames[-1][0].arrived if self._frames else 0.0
+        oldest = last - self._settings.window
+        if np.isfinite(self._begun):
+            oldest = min(oldest, max(self._begun, last - _LONGEST_STAND_S))
+        while self._frames and self._frames[0][0].arrived <= oldest:
+            self._frames.popleft()
+
+    def state(self, now: float) -> Settled | str:
+        """Where it stands now (s, by the bench's clock), or why it is not known to stand: a sentence."""
+        start = now - self._settings.window
+        left = self._begun + self._settings.wait - start
+        if left > _SLACK_S:
+            return f"too early: {left:.2f} s to wait"
+        usable, poses, faults = self._seen(start, now)
+        if why := self._too_few([frame.arrived for frame in usable], faults, start, now):
+            return why
+        stillness = judged(poses, self._settings.spread)
+        if stillness.why_not:
+            return stillness.why_not
+        kept = [frame for frame, keep in zip(usable, stillness.kept, strict=True) if keep]
+        poses = poses[stillness.kept]
+        mean = mean_pose(poses)
+        if self._bodies.has_base and self._bodies.base_motion == "still":
+            moving = in_base(kept, self._scattered)
+            poses = moving.poses[[not fault for fault in moving.faults]]
+        rejected = int((~stillness.kept).sum())
+        return Settled(mean, deviations_of_mean(poses, mean), len(kept), rejected, kept[0].arrived, kept[-1].arrived)
+
+    def stand(self) -> Stand | None:
+        """How the target has moved since the arm was commanded to stand; None where it was hardly seen."""
+        usable, poses, _ = self._seen(self._begun + self._settings.wait)
+        if len(usable) < max(self._settings.frames, _FEWEST):
+            return None
+        return drift_of(np.array([frame.arrived for frame in usable]), poses)
+
+    def _seen(self, after: float, until: float = np.inf) -> tuple[list[TrackerFrame], Array, list[str]]:
+        """Frames of some time (s) that show the target, its pose in each, and why the others do not."""
+        recent = [(frame, again) for frame, again in self._frames if after < frame.arrived <= until]
+        capture = in_base([frame for frame, _ in recent], self._bodies)
+        faults = [fault or (FROZEN if again else "") for fault, (_, again) in zip(capture.faults, recent, strict=True)]
+        usable = [frame for (frame, _), fault in zip(recent, faults, strict=True) if not fault]
+        return usable, capture.poses[[not fault for fault in faults]], faults
+
+    def _too_few(self, times: list[float], faults: list[str], start: float, now: float) -> str:
+        """Why the usable frames do not cover the window; empty if they do."""
+        s = self._settings
+        unusable = Counter(fault for fault in faults if fault).most_common(1)
+        reason = unusable[0][0] if unusable else "the tracker is silent" if not faults else "nothing more comes"
+        if len(times) < s.frames:
+            return f"too few frames: {len(times)} usable in {s.window:g} s, expected {s.frames}; {reason}"
+        longest = float(np.diff([start, *times, now]).max())
+        if longest > _GAP * s.window + _SLACK_S:
+            return f"no usable frame for {longest:.2f} s within the last {s.window:g} s; {reason}"
+        return ""
+
+
+def drift_of(times: Array, poses: Array) -> Stand | None:
+    """By straight lines of least squares through positions of poses (N x 4 x 4, m) at times (N, s, rising).
+
+    None for one moment.
+    """
+    middle, mean, span = times - times.mean(), mean_pose(poses), float(times[-1] - times[0])
+    if span <= 0:
+        return None
+    rates = middle @ poses[:, :3, 3] / float(middle @ middle)
+    level = poses.copy()
+    level[:, :3, 3] -= np.outer(middle, rates)
+    sds = deviations_of_mean(level, mean)[:3] * np.sqrt(12.0) / span  # of a slope, from that of a mean
+    return Stand(mean, rates, np.maximum(sds, _LEAST_RATE))
+
 
 _WELL_S = 0.1  # A tracker whose last frame was usable and came so lately is well
 _SAID_EVERY_S = 60.0
@@ -208,3 +353,162 @@ class MotionGate:
             elif not isinstance(settled := monitor.settled(), str):
                 return settled
         return settled
+
+
+_ENOUGH = 5
+_SURE, _FEWEST_STANDS = 2.5, 3  # Standard deviations, in each of most stands
+_MINUTE = 60.0
+_LEAST_SPEED = 0.001 / _MINUTE  # m/s: a servo that comes to rest moves so much
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Compares how far apart the target stood in two poses, and by how much it was turned, with the nominal arm.
+
+    Neither depends on where the tracker's frame, the base body and the tool body are. What is not known of the arm, and
+    a target that is not at its nominal place, make them differ as well: the limits have to be generous.
+    """
+
+    expected: Array  # ``base_T_tool`` of the nominal, rigid arm in each pose of the plan (N x 4 x 4, m)
+    settings: ArrivalSettings  # the limits
+
+    def doubt(self, pose: int, measured: Array, others: Mapping[int, Array]) -> str:
+        """Why the arm is not where it was commanded to be, a sentence; empty if it may be there.
+
+        Args:
+            pose: its index.
+            measured: ``base_T_target`` (4 x 4, m); the rotation is NaN where it is not known.
+            others: those of other poses by index. The one that fits worst decides, or the next where there are five or
+                more: one of them may be wrong itself.
+        """
+        places = [place for place in others if place != pose]
+        if not places:
+            return ""
+        before, expected = np.array([others[place] for place in places]), self.expected[places]
+        (far, angle), (far_here, angle_here) = _apart(before, measured), _apart(expected, self.expected[pose])
+        far, turned = _worst(far - far_here), _worst(angle - angle_here)
+        if far <= self.settings.astray and not turned > self.settings.astray_turned:
+            return ""
+        degrees = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
+        return (
+            f"the arm is not where it was commanded to be: measured {1000 * far:.0f} mm{degrees} off, as seen from "
+            f"other poses (allowed: {1000 * self.settings.astray:.0f} mm, "
+            f"{np.rad2deg(self.settings.astray_turned):.0f} deg)"
+        )
+
+    def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
+        """What is wrong with the tracker's units or handedness, by ``base_T_target`` of poses by their index.
+
+        Poses that are not where they were commanded to be count as well: in other units none is.
+        """
+        poses = list(measured)
+        return frame_mistake(self.expected[poses], np.array([measured[pose] for pose in poses]).reshape(-1, 4, 4))
+
+
+def _apart(poses: Array, pose: Array) -> tuple[Array, Array]:
+    """How far each is from one (m), and by which angle it is turned (rad), whatever frames they are given in."""
+    cosines = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1) / 2
+    return np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1), np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def _worst(differences: Array) -> float:
+    """The largest, or the next where there are enough; NaN where nothing is known."""
+    finite = np.sort(np.abs(differences[~np.isnan(differences)]))[::-1]
+    return float(finite[1 if len(finite) >= _ENOUGH else 0]) if len(finite) else np.nan
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A motion of the target while the arm should stand."""
+
+    speed: float  # root mean square (m/s)
+    poses: int  # in how many it was seen
+
+    @classmethod
+    def of(cls, stands: Sequence[Stand]) -> "Drift | None":
+        """One that most of the stands show, three at least."""
+        if len(stands) < _FEWEST_STANDS:
+            return None
+        rates, sds = (np.array([getattr(stand, name) for stand in stands]) for name in ("rates", "sds"))
+        moving = int(np.sum(np.sqrt(np.mean((rates / sds) ** 2, axis=1)) > _SURE))
+        speed = float(np.sqrt(np.mean(np.sum(rates**2, axis=1))))
+        return cls(speed, moving) if 2 * moving > len(stands) and speed > _LEAST_SPEED else None
+
+    @property
+    def sentence(self) -> str:
+        speed = _MINUTE * 1000 * self.speed
+        return (
+            f"the target moves by {speed:.{1 if speed < 10 else 0}f} mm/min while the arm should stand (in "
+            f"{self.poses} poses): a joint gives way. Look at the screws of the horns, at gears and supply; a servo "
+            "that is too weak for its load gives way as well: measure poses in which it carries less"
+        )
+
+    @property
+    def content(self) -> dict[str, Any]:
+        return {"mm_per_min": _MINUTE * 1000 * self.speed, "poses": self.poses, "what": f"{self.sentence}."}
+
+
+class Evidence:
+    """Everything that was measured, of poses that count and of others.
+
+    Args:
+        arrival: compares poses with the model's.
+        is_tolerated: whether the run goes on despite a mistake of the tracker's frame; by default it never does.
+        fewest: poses that show one.
+        restless_ends: whether poses in a row in which the arm does not come to stand end a run, whatever the reason.
+    """
+
+    def __init__(
+        self,
+        arrival: Arrival,
+        is_tolerated: Callable[[FrameMistake], bool] = lambda mistake: False,
+        fewest: int = FEWEST,
+        *,
+        restless_ends: bool = False,
+    ) -> None:
+        self.doubted: dict[int, Mapping[str, Any]] = {}  # what was recorded of poses that do not count, by their index
+        self.arrival, self._is_tolerated = arrival, is_tolerated
+        self._fewest, self._restless_ends = fewest, restless_ends
+        self._stands: list[tuple[int, Stand]] = []
+        self._failed = 0
+
+    def stood(self, pose: int, stand: Stand | None) -> None:
+        """How the target moved while the arm should stand in a pose; None where it was hardly seen."""
+        if stand is not None:
+            self._stands.append((pose, stand))
+
+    def succeeded(self, pose: int) -> None:
+        self._failed = 0
+        self.doubted.pop(pose, None)
+
+    def failed(self, why: str) -> None:
+        """The arm did not come to stand in a pose, or stood elsewhere.
+
+        Raises StopRequested where that happened several times in a row, and the target moves meanwhile.
+        """
+        self._failed += 1
+        if self._failed < self.arrival.settings.in_a_row:
+            return
+        if (drift := self.drift(self._failed)) is not None:
+            raise StopRequested(drift.sentence, how="failed")
+        if self._restless_ends:
+            text = f"the arm did not come to stand {self._failed} times in a row ({why})"
+            raise StopRequested(f"{text}: does a servo stall, or let go?", how="failed")
+
+    def drift(self, last: int = 0) -> Drift | None:
+        """A motion of the target in the last so many stands, or in all of them."""
+        return Drift.of([stand for _, stand in self._stands[-last:]])
+
+    def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
+        """What is wrong with the tracker's units or handedness, by ``base_T_target`` of measured poses and others."""
+        glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
+        doubted = {pose: pose_of(record) for pose, record in self.doubted.items()}
+        seen = {**glimpsed, **measured, **doubted}
+        return self.arrival.mistake(seen) if len(seen) >= self._fewest else None
+
+    def refusal(self, measured: Mapping[int, Array]) -> str:
+        """Why the run cannot go on with a mistake of units or frame; empty if it can. See ``mistake``."""
+        mistake = self.mistake(measured)
+        if mistake is None or self._is_tolerated(mistake):
+            return ""
+        return f"{mistake.sentence}. {mistake.mend} The poses that were measured are kept as they came"

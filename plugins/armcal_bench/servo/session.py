@@ -15,11 +15,10 @@ from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError, Location
 
 from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.evidence import Evidence
 from armcal_bench.acquisition.heat import COOLED_TO
 from armcal_bench.acquisition.run_log import Log, Progress
 from armcal_bench.acquisition.session import opened, ready_run
-from armcal_bench.acquisition.tracker_monitor import MotionGate, StopRequested
+from armcal_bench.acquisition.tracker_monitor import Evidence, MotionGate, StopRequested
 from armcal_bench.bench import closing
 from armcal_bench.joint_check import BASE, Verdict, answered, between, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
