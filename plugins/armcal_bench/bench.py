@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from armcal.arm.assembly import Arm, only_arm
@@ -39,26 +39,22 @@ Name = Annotated[str, Field(min_length=1, max_length=100)]
 class BodySettings(Settings):
     """The bodies by the tracker's own names, and what is known about where they sit.
 
-    Attributes:
-        base_motion: ``moving``: each frame is taken in the base body's own pose of that frame. ``still``: the base body's
-            poses of all frames of a capture are averaged first.
-        base_T_reference: where the base body (or the tracker's world, without one) is in the arm's base frame.
-        tool_body_T_target: where the measured target is on the tool body.
-
-    """  # noqa: E501
+    With a ``moving`` base each frame is taken in the base body's own pose of that frame; with a ``still`` one the base
+    body's poses of all frames of a capture are averaged first.
+    """
 
     tool: Name = "tool"  # the body on the tool
     base: Name = NONE  # the body that stands still with the arm's base; ``none`` where the tracker's world does
     base_motion: Literal["moving", "still"] = "moving"
+    # where the base body (or the tracker's world, without one) is in the arm's base frame
     base_T_reference: PoseSettings = Field(default_factory=PoseSettings)
-    tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)
+    tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)  # where the measured target is on the tool
 
     @model_validator(mode="after")
     def _two_bodies(self) -> Self:
         if self.tool == self.base:
-            raise ValueError(
-                f"found {self.tool!r} for both tool and base, expected two bodies (base: none for no base)"
-            )
+            text = f"found {self.tool!r} for both tool and base"
+            raise ValueError(f"{text}, expected two bodies (base: none for no base)")
         return self
 
     @property
@@ -66,15 +62,10 @@ class BodySettings(Settings):
         return self.base != NONE
 
 
-@dataclass(frozen=True)
-class Capture:
-    """Some frames, in the arm's base frame.
+class Capture(NamedTuple):
+    """Some frames, in the arm's base frame."""
 
-    Attributes:
-        poses: ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation alone is NaN where
-            the tracker gives only positions.
-    """
-
+    # ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation, too, of a tracker of positions
     poses: Array
     faults: tuple[str, ...]  # why a frame does not show it, a sentence; empty where it does (N)
 
@@ -105,22 +96,24 @@ def in_base(frames: Sequence[TrackerFrame], settings: BodySettings) -> Capture:
 
 def tool_fault(frame: TrackerFrame, settings: BodySettings) -> str:
     """Why a frame does not show where the target is in the tracker's world; empty if it does."""
-    pose = frame.bodies.get(settings.tool)
-    if pose is None:
-        return _unseen(frame, settings.tool, "tool")
-    if np.isnan(pose[0, 0]) and any(settings.tool_body_T_target.position):
-        return f"the tool body {settings.tool!r} has no orientation, and the target is not at its origin"
-    return ""
+    off_origin = any(settings.tool_body_T_target.position)
+    return _fault(frame, settings.tool, "tool", ", and the target is not at its origin" if off_origin else None)
 
 
 def base_fault(frame: TrackerFrame, settings: BodySettings) -> str:
     """Why a frame does not show where the base is; empty if it does, or nobody asks."""
-    if not settings.has_base:
-        return ""
-    pose = frame.bodies.get(settings.base)
+    return _fault(frame, settings.base, "base", "") if settings.has_base else ""
+
+
+def _fault(frame: TrackerFrame, name: str, role: str, needs_rotation: str | None) -> str:
+    pose = frame.bodies.get(name)
     if pose is None:
-        return _unseen(frame, settings.base, "base")
-    return f"the base body {settings.base!r} has no orientation" if np.isnan(pose[0, 0]) else ""
+        others = [other for other, pose in frame.bodies.items() if pose is not None][:_NAMES_SHOWN]
+        seen = f"it sees {', '.join(others)}" if others else "it sees none"
+        return f"the tracker does not see the {role} body {name!r} ({seen})"
+    if needs_rotation is not None and np.isnan(pose[0, 0]):
+        return f"the {role} body {name!r} has no orientation{needs_rotation}"
+    return ""
 
 
 def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySettings) -> bool:
@@ -133,12 +126,6 @@ def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySett
     pairs = [(frame.bodies.get(name), before.bodies.get(name)) for name in names]
     seen = [(a, b) for a, b in pairs if a is not None and b is not None]
     return len(seen) == len(pairs) and all(a.tobytes() == b.tobytes() for a, b in seen)
-
-
-def _unseen(frame: TrackerFrame, name: str, role: str) -> str:
-    others = [other for other, pose in frame.bodies.items() if pose is not None][:_NAMES_SHOWN]
-    seen = f"it sees {', '.join(others)}" if others else "it sees none"
-    return f"the tracker does not see the {role} body {name!r} ({seen})"
 
 
 def _stacked(frames: Sequence[TrackerFrame], name: str) -> Array:
@@ -185,15 +172,8 @@ class BenchSettings(Settings):
     simulator: dict[str, Any] | None = None
 
 
-class Closable(Protocol):
-    """A part of a bench that was opened."""
-
-    def close(self) -> None:
-        """Let go of it."""
-
-
 @contextmanager
-def closing(*parts: Closable) -> Iterator[None]:
+def closing(*parts: Any) -> Iterator[None]:
     """Parts of a bench, each closed at the end whatever another raises; the first fault of all passes."""
     faults = list[BaseException]()
     try:
@@ -218,11 +198,7 @@ class Bench:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
-        """The bench of an experiment.
-
-        Raises:
-            ConfigError: none is configured, or it is refused.
-        """
+        """The bench of an experiment; ConfigError where none is configured, or it is refused."""
         if experiment.settings.bench is None:
             hint = "Say what moves and measures the arm: bench: {link: ..., device: ..., tracker: ...}."
             raise ConfigError("found no bench.", where=experiment.source.where((SECTION,)), hint=hint)
@@ -230,22 +206,13 @@ class Bench:
 
     @property
     def arm(self) -> Arm:
-        """The only arm.
-
-        Raises:
-            ConfigError: there are several.
-        """
+        """The only arm; ConfigError where there are several."""
         where, hint = self.experiment.source.where(("arms",)), "Configure each arm's bench on its own."
         return only_arm(self.experiment.system.arms, "a bench moves a single arm", hint, where)
 
     @cached_property
     def simulation(self) -> RunningBench | None:
-        """The simulated bench that stands in for the parts; None where they are real.
-
-        Raises:
-            ConfigError: refused, or none is configured.
-            InputError: its folder cannot be used.
-        """
+        """The simulated bench that stands in for the parts; None where they are real."""
         if self.settings.simulated is None:
             return None
         simulator: SimulatedBench = self._built("simulator", kind="bench")
@@ -262,11 +229,7 @@ class Bench:
             yield self.simulation.clock
 
     def device(self) -> JointDevice:
-        """The device, on its link if one is configured, or what stands in for it.
-
-        Raises:
-            ConfigError: refused, or none is configured.
-        """
+        """The device, on its link if one is configured, or what stands in for it; ConfigError where it is refused."""
         link = None if self.settings.link is None else self._built("link")
         joints = tuple(self.arm.commanded)
         built: JointDevice = self._built("device", joints, link)
