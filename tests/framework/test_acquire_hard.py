@@ -23,7 +23,7 @@ from armcal.io.journal import Journal, JournalFailedError, JournalFullError
 from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.drive import Drive, PathPlanner
-from armcal_bench.acquisition.schedule import Rest
+from armcal_bench.acquisition.preparation import Rest
 from armcal_bench.acquisition.session import RunOptions, acquire
 from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
 from armcal_bench.acquisition.tracker_monitor import Arrival, TrackerMonitor

@@ -10,8 +10,8 @@ import pytest
 from armcal.devices.device import DeviceError, DeviceIdentity, DeviceLostError, DeviceUnwellError
 from armcal_bench.acquisition.drive import Drive, PathPlanner
 from armcal_bench.acquisition.heat import HeatModel
+from armcal_bench.acquisition.preparation import Scheduler
 from armcal_bench.acquisition.run_log import Progress
-from armcal_bench.acquisition.schedule import Scheduler
 from armcal_bench.acquisition.session import AcquisitionRun
 from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
 from armcal_bench.acquisition.tracker_monitor import MotionGate

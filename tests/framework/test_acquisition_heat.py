@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from armcal_bench.acquisition.drive import PathPlanner, travel
 from armcal_bench.acquisition.heat import NEVER, HeatModel
-from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler, forecast_schedule
+from armcal_bench.acquisition.preparation import LeaveOut, Measure, Rest, Scheduler, forecast_schedule
 from armcal_bench.acquisition.settings import ServoHeatSettings
 from hypothesis import given, settings
 from hypothesis import strategies as st

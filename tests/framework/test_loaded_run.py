@@ -11,8 +11,15 @@ import pytest
 from armcal.run.experiment import Experiment
 from armcal_bench.acquisition.drive import travel
 from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.preparation import prepare
-from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, ScheduleForecast, Scheduler, forecast_schedule
+from armcal_bench.acquisition.preparation import (
+    LeaveOut,
+    Measure,
+    Rest,
+    ScheduleForecast,
+    Scheduler,
+    forecast_schedule,
+    prepare,
+)
 from armcal_bench.acquisition.settings import ServoHeatSettings
 from armcal_simulation.bench.servo_model import ServoHeat, ServoJointSettings
 

@@ -25,22 +25,11 @@ from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 from armcal.plugins import blaming
 
-from armcal_bench.acquisition import run_log as entry
+from armcal_bench.acquisition import run_log
 from armcal_bench.acquisition.drive import Drive
 from armcal_bench.acquisition.heat import ThermalLimit
-from armcal_bench.acquisition.preparation import Prepared
-from armcal_bench.acquisition.run_log import (
-    OURS,
-    EndedHow,
-    Log,
-    Progress,
-    RunLog,
-    in_order,
-    measured_by,
-    write_measured,
-    write_outputs,
-)
-from armcal_bench.acquisition.schedule import LeaveOut, Measure, Rest, Scheduler
+from armcal_bench.acquisition.preparation import LeaveOut, Measure, Prepared, Rest, Scheduler
+from armcal_bench.acquisition.run_log import EndedHow, Log, Progress, RunLog
 from armcal_bench.acquisition.tracker_monitor import (
     Evidence,
     MotionGate,
@@ -77,7 +66,7 @@ class Ending:
 
     how: EndedHow
     sentence: str
-    arm: str
+    arm: str = "the arm holds"
 
 
 @dataclass
@@ -207,7 +196,7 @@ class AcquisitionRun:
 
     def _measure(self, step: Measure) -> None:
         drive, gate = self._drive, self._gate
-        self._log.record(entry.GOING, {"pose": self._ids[step.pose], **self._here()})
+        self._log.record(run_log.GOING, {"pose": self._ids[step.pose], **self._here()})
         try:
             drive.go(step.path, gate.measuring)
             drive.preload_backlash(self._scheduler.approaches[step.pose], gate.measuring)
@@ -286,7 +275,7 @@ class AcquisitionRun:
             raise StopRequested(refusal, how="refused")
 
     def _keep(self, pose: int, record: Mapping[str, Any]) -> None:
-        self._log.record(entry.MEASURED, record)
+        self._log.record(run_log.MEASURED, record)
         self._left.remove(pose)
         self._on_progress(self._log.progress)
 
@@ -306,7 +295,7 @@ class AcquisitionRun:
         self._left.append(pose)
 
     def _leave_out(self, pose: int, why: str) -> None:
-        self._log.record(entry.LEFT_OUT, {"pose": self._ids[pose], "why": why})
+        self._log.record(run_log.LEFT_OUT, {"pose": self._ids[pose], "why": why})
         self._left.remove(pose)
         self._on_progress(self._log.progress)
 
@@ -339,11 +328,11 @@ class AcquisitionRun:
         return True
 
     def _end(self, how: EndedHow, sentence: str, arm: str = "the arm holds") -> Ending:
-        self._log.record(entry.ENDED, {"how": how, "sentence": sentence, **self._here()})
+        self._log.record(run_log.ENDED, {"how": how, "sentence": sentence, **self._here()})
         return Ending(how, sentence, arm)
 
     def _notice(self, what: str, sentence: str) -> None:
-        self._log.record(entry.NOTICE, {"what": what, "sentence": sentence, "at": self._gate.clock.wall()})
+        self._log.record(run_log.NOTICE, {"what": what, "sentence": sentence, "at": self._gate.clock.wall()})
 
 
 _SAME = {"plan": "plan", "config": "configuration"}
@@ -381,9 +370,9 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         ArmcalError: the journal cannot be written; the arm was parked.
     """
     experiment, ids = prepared.bench.experiment, prepared.scheduler.ids
-    measured_by(experiment)
+    run_log.measured_by(experiment)
     header = _header(prepared, plan)
-    kept = opened_journal(options.folder, options.start, OURS, header, "run", _SAME)
+    kept = opened_journal(options.folder, options.start, run_log.OURS, header, "run", _SAME)
     with prepared.bench.clock() as clock, kept as journal:
         log, drift = RunLog(journal), None
         begun = identity = log.identity
@@ -409,14 +398,14 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
         else:
             try:
                 with opened(prepared, options, clock, check) as (gate, identity):
-                    log.record(entry.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
+                    log.record(run_log.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
                     evidence = Evidence(prepared.arrival)
                     ending = ready_run(prepared, options, log, gate, identity, evidence).run()
                     drift = evidence.drift()
             except (Exception, SystemExit):
                 if identity is not None:
                     with suppress(Exception):  # the journal holds it, whatever else is broken
-                        write_measured(options.folder, experiment, log.progress, digests())
+                        run_log.write_measured(options.folder, experiment, log.progress, digests())
                 raise
         progress = log.progress
         summary = {
@@ -426,12 +415,12 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
             "measured": len(progress.measured),
             "left_out": dict(progress.left_out),
             "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
-            "times": "written" if in_order(progress) else "left out: the clock was set back during the run",
+            "times": "written" if run_log.in_order(progress) else "left out: the clock was set back during the run",
             "gives_way": None if drift is None else drift.content,
             "board": identity.name,
             "digests": digests(),
         }
-        write_outputs(options.folder, experiment, progress, summary)
+        run_log.write_outputs(options.folder, experiment, progress, summary)
         return Outcome(ending, summary)
 
 

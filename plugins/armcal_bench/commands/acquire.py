@@ -16,9 +16,8 @@ from armcal.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_FAULT, EXIT_INCOMPLETE
 from armcal.io.journal import has_journal
 from armcal.io.signals import Signals
 
-from armcal_bench.acquisition.preparation import Prepared, prepare
+from armcal_bench.acquisition.preparation import LeaveOut, Prepared, Rest, ScheduleForecast, forecast_schedule, prepare
 from armcal_bench.acquisition.run_log import BENCH, DATASET, Progress
-from armcal_bench.acquisition.schedule import LeaveOut, Rest, ScheduleForecast, forecast_schedule
 from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
 from armcal_bench.acquisition.tracker_monitor import duration
 from armcal_bench.commands.common import FILE, Question, always, energise_option, load, on_bench, waits, warned
