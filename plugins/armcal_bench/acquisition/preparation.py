@@ -200,14 +200,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             poses.append(_nearest_settable(device, pose))  # half a count beyond a limit is the board's affair
         except DeviceRefusedError as fault:
             refuse(row, fault.message, fault.hint, fault)
-    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
-    if unknown := unknown_joint(settings.park, joints):
-        raise ConfigError(f"{unknown}.", where=where)
-    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
-    if (outside := _outside(park, limits)).any():
-        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
-        raise ConfigError(text, where=where, hint="Choose another pose.")
-    park = _nearest_settable(device, park)
+    park = _settable_park(experiment, settings, device, limits)
     # from which side each joint is to come; 0 where the plan does not say
     sides = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
     approaches = np.nan_to_num(np.array(sides).T.reshape(len(commands), -1))
@@ -217,7 +210,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
         if not planner.allowed(pose):
             hint = "Nothing was moved. Plan anew with this clearance, or take the pose out."
             refuse(row, f"pose {commands.ids[row]} is too near to something.", hint)
-    check_park(experiment, planner, prepared.scheduler.model, park, joints)
+    check_park(experiment, planner, prepared.scheduler.model, park, device.joint_names)
     planned = experiment.settings.plan.limits if experiment.settings.plan else {}
     return replace(prepared, warnings=stated_beyond(experiment, {**planned, **settings.limits}))
 
@@ -278,6 +271,18 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
         text = f"found no limits of the joint {missing[0]}."
         raise ConfigError(text, where=where, hint=f"Give them: limits: {{{missing[0]}: [-100 deg, 100 deg]}}.")
     return np.array([ends for ends in limits.values() if ends is not None])
+
+
+def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
+    """The angles (joints, rad) that the device can set nearest to the park pose."""
+    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
+    if unknown := unknown_joint(settings.park, joints):
+        raise ConfigError(f"{unknown}.", where=where)
+    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
+    if (outside := _outside(park, limits)).any():
+        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
+        raise ConfigError(text, where=where, hint="Choose another pose.")
+    return _nearest_settable(device, park)
 
 
 def check_park(

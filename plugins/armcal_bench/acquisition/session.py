@@ -407,21 +407,23 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
                     with suppress(Exception):  # the journal holds it, whatever else is broken
                         run_log.write_measured(options.folder, experiment, log.progress, digests())
                 raise
-        progress = log.progress
-        summary = {
-            "how": ending.how,
-            "why": ending.sentence,
-            "poses": len(prepared.plan),
-            "measured": len(progress.measured),
-            "left_out": dict(progress.left_out),
-            "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
-            "times": "written" if run_log.in_order(progress) else "left out: the clock was set back during the run",
-            "gives_way": None if drift is None else drift.content,
-            "board": identity.name,
-            "digests": digests(),
-        }
-        run_log.write_outputs(options.folder, experiment, progress, summary)
+        gives_way = None if drift is None else drift.content
+        summary = _summary(prepared, ending, log.progress)
+        summary |= {"gives_way": gives_way, "board": identity.name, "digests": digests()}
+        run_log.write_outputs(options.folder, experiment, log.progress, summary)
         return Outcome(ending, summary)
+
+
+def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str, Any]:
+    return {
+        "how": ending.how,
+        "why": ending.sentence,
+        "poses": len(prepared.plan),
+        "measured": len(progress.measured),
+        "left_out": dict(progress.left_out),
+        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+        "times": "written" if run_log.in_order(progress) else "left out: the clock was set back during the run",
+    }
 
 
 def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:

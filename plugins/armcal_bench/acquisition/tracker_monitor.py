@@ -385,8 +385,8 @@ class Arrival:
         if not places:
             return ""
         before, expected = np.array([others[place] for place in places]), self.expected[places]
-        (far, angle), (far_here, angle_here) = _apart(before, measured), _apart(expected, self.expected[pose])
-        far, turned = _worst(far - far_here), _worst(angle - angle_here)
+        seen, modelled = _apart(before, measured), _apart(expected, self.expected[pose])
+        far, turned = _worst(seen[0] - modelled[0]), _worst(seen[1] - modelled[1])
         if far <= self.settings.astray and not turned > self.settings.astray_turned:
             return ""
         degrees = "" if np.isnan(turned) else f" and {np.rad2deg(turned):.0f} deg"
