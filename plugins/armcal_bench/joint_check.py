@@ -28,7 +28,7 @@ from armcal_bench.acquisition.drive import PathPlanner
 from armcal_bench.acquisition.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
 from armcal_bench.acquisition.run_log import Log, Progress, measured_by
 from armcal_bench.acquisition.session import Ending, opened, ready_run
-from armcal_bench.acquisition.tracker_monitor import Evidence, StopRequested
+from armcal_bench.acquisition.tracker_monitor import Evidence, StopRequested, pose_of
 from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.measured_frame import FEWEST, FrameMistake
 from armcal_bench.servo.record import BEGUN, POSE
@@ -45,7 +45,6 @@ from armcal_bench.servo.tracked_body import (
     turn_of_point,
     twist_angles,
 )
-from armcal_bench.settling import pose_of
 
 _LEVER_M = 0.1
 _STILL = math.radians(1.5)
