@@ -205,7 +205,7 @@ def _errors(run: Run) -> str:
     """Of records that were held out, and of stretches."""
     turns, outcome = run.result.table.turns, run.result.pose_residual
     degrees = "" if turns is None else f", {turns.calibrated['holdout'].mean:.4f} deg"
-    covered = next(iter(run.result.intervals.as_dict().values()))["holdout"]["share"]["90"]
+    covered = next(iter(run.result.intervals.values())).holdout.stated["90"]
     text = f"{run.result.table.calibrated['holdout'].mean:.4f} mm{degrees}; 90 % intervals cover {100 * covered:.1f} %"
     if outcome is not None and outcome.stretches is not None:
         text += f"; stretches {outcome.stretches.without:.3f} -> {outcome.stretches.with_it:.3f} {outcome.unit}"

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from armcal.diagnose.coverage import Scores, missed, scored
+from armcal.estimate.prediction import Predictor
 from armcal.estimate.robust import fit
 from armcal.problem.problem import Problem
 from armcal.problem.variants import with_drift
@@ -36,6 +38,11 @@ def drifting_problem() -> tuple[Any, ...]:
     train, held = np.setdiff1d(np.arange(60), np.arange(3, 60, 4)), np.arange(3, 60, 4)
     fitted = fit(problem.with_records(records).subset(train), loaded.estimator, loaded.parameters.nominal())
     return loaded, dataset, problem, records, train, held, fitted
+
+
+def score(by: Predictor, held: Problem) -> dict[str, Scores]:
+    """By recording: the residuals of records that a fit did not see in units of what was predicted."""
+    return {name: scored(held, own, by.spreads(held, name)) for name, own in missed(by, held).items()}
 
 
 def dense_slopes(problem, values, records, step=1e-7):

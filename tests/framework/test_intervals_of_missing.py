@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.diagnose.coverage import Scores, coverage, missed, predictor, score, stretch
+from armcal.diagnose.coverage import Scores, coverage, missed, predictor, stretch
 from armcal.estimate.robust import fit
 from armcal.estimate.simulation import with_channels
 from armcal.run.experiment import Experiment
-from drifting import DEMO, FREE, problem_of
+from drifting import DEMO, FREE, problem_of, score
 
 SECOND = "measurements.second={type: tip_position, noise_mm: 0.5}"
 SEEN = np.arange(60) % 3 == 0

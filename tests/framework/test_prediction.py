@@ -22,7 +22,6 @@ from armcal.diagnose.coverage import (
     coverage_finding,
     fit_and_predict,
     predictor,
-    score,
     stretch,
     whitened_like,
 )
@@ -36,7 +35,7 @@ from armcal.problem.variants import with_drift
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from click.testing import CliRunner, Result
-from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of
+from drifting import DEMO, DRIFTING, FREE, dense_drift, dense_slopes, drifting_problem, problem_of, score
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "lrm_arm"
@@ -404,7 +403,7 @@ def test_a_run_tells_what_its_intervals_hold(recording: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not MEASURED.exists(), reason=f"the arm's measurements are not at {MEASURED}")
 def test_on_the_real_arm_ninety_percent_intervals_hold_ninety_percent() -> None:
-    found = calibrate(Experiment.load(CONFIGS / "option1.yaml", data=MEASURED)).intervals.crossed["same"]
+    found = calibrate(Experiment.load(CONFIGS / "option1.yaml", data=MEASURED)).intervals["same"].crossed
     assert found.coordinates == 939
     assert 0.87 <= found.stated["90"] <= 0.93
     assert 0.93 <= found.stretched["radius_95"] <= 0.97

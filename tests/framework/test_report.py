@@ -21,7 +21,7 @@ from armcal.base.domains import Interval, Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.config.system import StaticsSettings, System
 from armcal.diagnose.causes import contradictions
-from armcal.diagnose.coverage import IntervalResult, intervals
+from armcal.diagnose.coverage import intervals
 from armcal.diagnose.fit import Fit, Prepared, RecordErrors
 from armcal.diagnose.outliers import large_errors, noise_of, outlying
 from armcal.diagnose.residual_structure import depends, structure
@@ -179,7 +179,7 @@ def fit_known(
     system, problem = System({}, {}, StaticsSettings(), {}), SimpleNamespace(backend=backend)
     ready = Prepared(system, dataset, cast(Problem, problem), split, cast(Start, None))
     nothing = (structure, priors_alone, rounding, large_errors, elsewhere, new_recording, hidden_payload)
-    analyses = {**dict.fromkeys(nothing), contradictions: (), suggestions: (), intervals: IntervalResult()}
+    analyses = {**dict.fromkeys(nothing), contradictions: (), suggestions: (), intervals: {}}
     analyses[noise_of] = np.ones(len(dataset)), 3.0
     judged = np.where(np.isin(np.arange(len(dataset)), split.holdout), errors.calibrated_mm, np.nan)
     return fit_that_found(found, analyses, ready, errors=errors, judged_mm=judged, unit="mm", name="Tip", drifts=False)

@@ -209,14 +209,18 @@ _SLOW = 3
 _CUBIC = 3
 _AXES = ("x", "y", "z")
 _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_BOTH_SIDES = "visit the same poses from both sides of {joint}"
 _SECOND_LOAD = "repeat some poses with a second payload"
 _REPEATS = "repeat one pose at the start, in the middle and at the end"
-
+_STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
 _SURROUNDINGS = (
-    ("payload", "the payload", "torsional_spring or compliance; the payload's centre"),
-    ("temperature", "the temperature", "thermal_length"),
+    ("payload", "the payload", "torsional_spring or compliance; the payload's centre", _SECOND_LOAD),
+    ("temperature", "the temperature", "thermal_length", "repeat some poses cold and warm"),
 )
+_MOST_STEPS, _MOST_SLIPS = 40, 12
+"""Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
+_FEWEST_APART = 4
+_LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
+"""Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +237,6 @@ class Cause:
 
     kind: str
     subject: str  # the joint or site, as a user names it; empty where it is none
-    arm: str  # the arm's name; empty where it is none
     words: str  # what residuals depend on, as the end of a sentence
     effect: str  # the effect that would model it, and on what; empty if there is none
     measure: str  # which measurement would show it
@@ -245,154 +248,163 @@ class Cause:
 
 @dataclass(frozen=True)
 class Records:
+    """Records whose residuals are looked at, and how these move."""
+
+    problem: Problem
     dataset: Dataset
     motion: Motion
+    positions: tuple[Array, ...]  # what each factor should read of a position (3 x N; m), or nothing (0 x N)
+    moves: Moves  # by parameters that are held
 
     @property
-    def sizes(self) -> tuple[int, ...]:
-        return tuple(slope.shape[0] for slope in self.motion.slopes)
+    def arms(self) -> Mapping[str, Arm]:
+        return self.problem.blueprint.arms
+
+    @cached_property
+    def order(self) -> Array:
+        return recorded_order(self.dataset)
+
+    @cached_property
+    def rank(self) -> Array:
+        """How many records were recorded before each (N)."""
+        return np.argsort(np.argsort(self.order, kind="stable"), kind="stable")
+
+    def shown(self, channel: str) -> str:
+        return shown_joint(channel, self.arms)
+
+    def si(self, channel: str) -> str:
+        arm, _, joint = channel.partition(".")
+        return "rad" if self.arms[arm].commanded[joint] == "angle" else "m"
 
     def along(self, joint: str, features: Array) -> tuple[Array, ...]:
         return tuple(slope[:, :, None] * features[None] for slope in self.motion.along(joint))
 
     def axes(self, features: Array) -> tuple[Array, ...]:
-        whole, place, parts = sum(self.sizes) * features.shape[1], 0, []
-        for size in self.sizes:
-            part = np.zeros((size, len(features), whole))
-            for entry in range(size):
-                part[entry, :, place : place + features.shape[1]] = features
-                place += features.shape[1]
-            parts.append(part)
-        return tuple(parts)
+        sizes = [slope.shape[0] for slope in self.motion.slopes]
+        every = np.einsum("rs,nk->rnsk", np.eye(sum(sizes)), features).reshape(sum(sizes), len(features), -1)
+        return tuple(np.split(every, np.cumsum(sizes)[:-1]))
+
+    def jumps(self, columns: Sequence[Array], most: int) -> Iterator[tuple[str, tuple[Array, ...]]]:
+        """What columns are from one record on, for several places in the recording, and after which it is, in words."""
+        if np.ptp(self.order) <= 0:
+            return
+        ids, inner = np.array(self.dataset.ids)[np.argsort(self.rank)], len(self.rank) - 2 * _FEWEST_APART + 1
+        step = max(_FEWEST_APART, -(-inner // most))
+        for place in range(_FEWEST_APART + step // 2, _FEWEST_APART + inner, step):
+            after = (self.rank >= place)[:, None]
+            yield f"whether a record was measured before or after {ids[place]}", tuple(c * after for c in columns)
 
 
-def causes_of(problem: Problem, here: Records, positions: Sequence[Array], moves: Moves) -> Iterator[Cause]:
-    """Causes in the arm, then outside of it; ``positions`` are those that instruments should read (3 x N; m)."""
-    arms, motion, dataset = problem.blueprint.arms, here.motion, here.dataset
-    yield from _of_held(problem, moves)
+def causes_of(here: Records) -> Iterator[Cause]:
+    """Causes in the arm, then outside of it."""
+    dataset = here.dataset
+    yield from _of_held(here)
     yield from _of_order(here)
-    for name, arm in arms.items():
-        loads = motion.loads[name]
-        for joint, dimension in arm.commanded.items():
-            index = arm.joint_names.index(joint)
-            shown = shown_joint(f"{name}.{joint}", arms)
-            angle = dimension == "angle"
-            yield from _of_level(here, name, f"{name}.{joint}", shown, dimension)
-            yield from _of_approach(here, name, joint, shown, "rad" if angle else "m")
-            yield from _of_coupling(here, name, arm, joint, shown)
-            yield from _of_torque(here, name, f"{name}.{joint}", shown, loads.efforts[index], angle)
-        yield from _of_moments(problem, here, arm, loads, len(arms) == 1)
-        yield from _of_rates(here, arm, arms)
-    for channel, words, effect in _SURROUNDINGS:
+    for name, arm in here.arms.items():
+        for joint in arm.commanded:
+            channel = f"{name}.{joint}"
+            yield from _of_level(here, channel)
+            yield from _of_approach(here, channel)
+            yield from _of_coupling(here, channel, arm)
+            yield from _of_torque(here, channel, here.motion.loads[name].efforts[arm.joint_names.index(joint)])
+        yield from _of_moments(here, arm)
+        yield from _of_rates(here, arm)
+    for channel, words, effect, measure in _SURROUNDINGS:
         if dataset.has(channel) and np.ptp(dataset.column(channel)) > 0:
             feature = dataset.column(channel)
             columns = here.axes((feature - feature.mean())[:, None] / feature.std())
-            measure = _SECOND_LOAD if channel == "payload" else "repeat some poses cold and warm"
-            yield Cause(channel, "", "", words, effect, measure, columns)
-    yield from _outside(here, problem, positions, moves)
+            yield Cause(channel, "", words, effect, measure, columns)
+    yield from _of_mistakes(here)
+    yield from _of_loads(here)
+    yield from _of_instrument(here)
+    yield from _of_steps(here)
 
 
-def _of_held(problem: Problem, moves: Moves) -> Iterator[Cause]:
-    for name in filter(moves.__contains__, candidates(problem.parameters)):
-        block, columns = problem.parameters[name], moves[name]
-        words, measure = f"{name}, which is held", "armcal identify --fixed, which judges it on records held out"
-        one = block.domain.dof == 1
-        labels, unit = (("off by",), block.unit) if one else ((), "")
-        yield Cause("held", name, "", words, f"free {name} (parameters.free)", measure, columns, labels, unit)
+def _of_held(here: Records) -> Iterator[Cause]:
+    parameters = here.problem.parameters
+    for name in filter(here.moves.__contains__, candidates(parameters)):
+        block, measure = parameters[name], "armcal identify --fixed, which judges it on records held out"
+        labels, unit = (("off by",), block.unit) if block.domain.dof == 1 else ((), "")
+        effect = f"free {name} (parameters.free)"
+        yield Cause("held", name, f"{name}, which is held", effect, measure, here.moves[name], labels, unit)
 
 
 def _of_order(here: Records) -> Iterator[Cause]:
-    order = recorded_order(here.dataset)
+    order = here.order
     if np.ptp(order) <= 0:
         return
-    place = (order - order.min()) / np.ptp(order)
-    slow = legendre.legvander(2 * place - 1, _SLOW)  # with its mean, which a drift has
-    yield Cause(
-        "order",
-        "",
-        "",
-        "the recorded order: what is measured drifts slowly as a whole",
-        "parameters.drift on the base's position",
-        _REPEATS,
-        here.axes(slow),
-    )
+    slow = legendre.legvander(2 * (order - order.min()) / np.ptp(order) - 1, _SLOW)  # with its mean, as a drift has
+    words = "the recorded order: what is measured drifts slowly as a whole"
+    yield Cause("order", "", words, "parameters.drift on the base's position", _REPEATS, here.axes(slow))
     for channel in here.motion.channels:
-        arm, _, joint = channel.partition(".")
+        joint = channel.partition(".")[2]
         words = f"the recorded order: {joint} drifts slowly along its own motion"
         effect = f"parameters.drift on the zero of {joint}"
-        yield Cause("order", joint, arm, words, effect, _REPEATS, here.along(channel, slow))
+        yield Cause("order", joint, words, effect, _REPEATS, here.along(channel, slow))
 
 
-def _of_level(here: Records, arm: str, channel: str, shown: str, dimension: str) -> Iterator[Cause]:
-    command = here.dataset.column(channel)
-    levels = np.unique(np.round(_stated(command), 9))
+def _of_level(here: Records, channel: str) -> Iterator[Cause]:
+    command, shown, si = here.dataset.column(channel), here.shown(channel), here.si(channel)
+    levels, labels = np.unique(np.round(_stated(command), 9)), tuple[str, ...]()
     if len(levels) < 2:
         return
-    unit = display_unit(dimension)
     if len(levels) <= MOST_LEVELS:
-        features = _centred((np.abs(command[:, None] - levels[None]) < 1e-8).astype(float), command)
-        labels = tuple(f"{to_unit(level, unit.name):.4g} {unit.name}" for level in levels)
-        effect = f"servo_map on {shown}" if len(levels) <= _CUBIC else f"gear_error or servo_map on {shown}"
+        unit = display_unit("angle" if si == "rad" else "length").name
+        features = (np.abs(command[:, None] - levels[None]) < 1e-8).astype(float)
+        labels = tuple(f"{to_unit(level, unit):.4g} {unit}" for level in levels)
     else:
         middle, half = (levels[0] + levels[-1]) / 2, (levels[-1] - levels[0]) / 2
-        features = _centred(legendre.legvander((command - middle) / half, _CUBIC)[:, 1:], command)
-        labels, effect = (), f"gear_error or servo_map on {shown}"
-    between = f"command {shown} to levels in between, from both sides"
-    si = "rad" if dimension == "angle" else "m"
-    along = f"the angle of {shown}, along its own motion" if si == "rad" else f"the travel of {shown}, along itself"
-    yield Cause("level", shown, arm, along, effect, between, here.along(channel, features), labels, si)
-    yield Cause(
-        "level",
-        shown,
-        arm,
-        f"the {'angle' if si == 'rad' else 'travel'} of {shown}, in directions that {shown} does not move",
-        f"more free geometry about {shown}, or compliance there",
-        f"repeat some poses with a second payload: what moves is compliance, the rest geometry of {shown}",
-        here.axes(features),
-    )
+        features = legendre.legvander((command - middle) / half, _CUBIC)[:, 1:]
+    features = _centred(features, command)
+    effect = f"{'' if len(levels) <= _CUBIC else 'gear_error or '}servo_map on {shown}"
+    measure = f"command {shown} to levels in between, from both sides"
+    what, itself = ("angle", "its own motion") if si == "rad" else ("travel", "itself")
+    words = f"the {what} of {shown}, along {itself}"
+    yield Cause("level", shown, words, effect, measure, here.along(channel, features), labels, si)
+    words = f"the {what} of {shown}, in directions that {shown} does not move"
+    effect = f"more free geometry about {shown}, or compliance there"
+    measure = f"{_SECOND_LOAD}: what moves is compliance, the rest geometry of {shown}"
+    yield Cause("level", shown, words, effect, measure, here.axes(features))
 
 
-def _of_approach(here: Records, arm: str, joint: str, shown: str, si: str) -> Iterator[Cause]:
-    channel, command = f"{arm}.approach.{joint}", here.dataset.column(f"{arm}.{joint}")
-    effect, side = f"approach_backlash on {shown}", f"the side {shown} was approached from"
-    if here.dataset.has(channel):
-        came = here.dataset.column(channel)
+def _of_approach(here: Records, channel: str) -> Iterator[Cause]:
+    arm, _, joint = channel.partition(".")
+    shown, side = here.shown(channel), f"{arm}.approach.{joint}"
+    effect, words = f"approach_backlash on {shown}", f"the side {shown} was approached from"
+    if here.dataset.has(side):
+        came = here.dataset.column(side)
     else:
-        place = np.argsort(recorded_order(here.dataset), kind="stable")
-        moved = np.sign(np.diff(np.nan_to_num(command[place]), prepend=np.nan_to_num(command[place[:1]])))
-        came = np.empty(len(command))
-        came[place] = moved[np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))]
+        command = np.nan_to_num(here.dataset.column(channel))[np.argsort(here.rank)]
+        moved = np.sign(np.diff(command, prepend=command[:1]))
+        came = moved[np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))][here.rank]
         effect += ", with a column for the approach"
-        side += ", if it went from pose to pose in the recorded order"
+        words += ", if it went from pose to pose in the recorded order"
     if _spread(came) <= 0:
         return
-    sign, measure = np.nan_to_num(-came[:, None]), _BOTH_SIDES.format(joint=shown)
-    along = here.along(f"{arm}.{joint}", sign)
-    yield Cause(
-        "approach", shown, arm, f"{side}, along its own motion", effect, measure, along, ("half of its play",), si
-    )
-    words = f"{side}, in directions that {shown} does not move"
-    yield Cause("approach", shown, arm, words, "", measure, here.axes(sign))
+    sign, measure = np.nan_to_num(-came[:, None]), f"visit the same poses from both sides of {shown}"
+    columns, labels = here.along(channel, sign), ("half of its play",)
+    yield Cause("approach", shown, f"{words}, along its own motion", effect, measure, columns, labels, here.si(channel))
+    words += f", in directions that {shown} does not move"
+    yield Cause("approach", shown, words, "", measure, here.axes(sign))
 
 
-def _of_coupling(here: Records, name: str, arm: Arm, joint: str, shown: str) -> Iterator[Cause]:
+def _of_coupling(here: Records, channel: str, arm: Arm) -> Iterator[Cause]:
+    joint, shown = channel.partition(".")[2], here.shown(channel)
     for other, dimension in arm.commanded.items():
-        command = here.dataset.column(f"{name}.{other}")
+        command = here.dataset.column(f"{arm.name}.{other}")
         if other == joint or dimension != arm.commanded[joint] or _spread(command) <= 0:
             continue
-        feature = _centred(np.nan_to_num(command)[:, None], command)
         words = f"the command of {other}, along {shown}'s own motion: {other} moves {shown} with it"
         measure = f"move {other} alone from end to end, and watch {shown}"
-        columns = here.along(f"{name}.{joint}", feature)
-        yield Cause("coupling", f"{other} on {shown}", name, words, "", measure, columns, ("share",), "1")
+        columns = here.along(channel, _centred(np.nan_to_num(command)[:, None], command))
+        yield Cause("coupling", f"{other} on {shown}", words, "", measure, columns, ("share",), "1")
 
 
-def _of_torque(here: Records, arm: str, channel: str, shown: str, effort: Array, revolute: bool) -> Iterator[Cause]:
+def _of_torque(here: Records, channel: str, effort: Array) -> Iterator[Cause]:
     if _spread(effort) <= 1e-9 * max(1.0, float(np.abs(_stated(effort)).max(initial=0.0))):
         return
-    effort = np.nan_to_num(effort)
-    load, per = ("torque about", "rad_per_Nm") if revolute else ("force along", "")
-    si, cubic = ("rad", "rad_per_Nm3") if revolute else ("m", "")
+    effort, shown, si = np.nan_to_num(effort), here.shown(channel), here.si(channel)
+    load, per, cubic = ("torque about", "rad_per_Nm", "rad_per_Nm3") if si == "rad" else ("force along", "", "")
     both = f"poses on both sides of zero {load.split()[0]} at {shown}, some with a second payload"
     laws = (
         (f"the {load} {shown}", f"torsional_spring on {shown}", _SECOND_LOAD, effort, "compliance", per),
@@ -403,56 +415,151 @@ def _of_torque(here: Records, arm: str, channel: str, shown: str, effort: Array,
     for words, effect, measure, feature, label, unit in laws:
         if np.ptp(feature) > 0:
             columns = here.along(channel, feature[:, None])
-            yield Cause("torque", shown, arm, words, effect, measure, columns, (label,), unit)
+            yield Cause("torque", shown, words, effect, measure, columns, (label,), unit)
 
 
-def _of_moments(problem: Problem, here: Records, arm: Arm, loads: SiteLoads, alone: bool) -> Iterator[Cause]:
+def _of_moments(here: Records, arm: Arm) -> Iterator[Cause]:
     """A symmetric compliance at each site, seen by the factors that measure this arm's tip in its base frame."""
     seen = [
         [channel.rpartition(".")[2] for channel in factor.output_channels] == list(_AXES)
-        and tuple(problem.blueprint.measurements[factor.name].arms) == (arm.name,)
-        for factor in (kernel.factor for kernel in problem.kernels)
+        and tuple(here.problem.blueprint.measurements[factor.name].arms) == (arm.name,)
+        for factor in (kernel.factor for kernel in here.problem.kernels)
     ]
-    if not any(seen):
-        return
+    loads, alone = here.motion.loads[arm.name], len(here.arms) == 1
     for site, (moment, lever) in enumerate(zip(loads.moments, loads.levers, strict=True)):
         moved = []
         for j, k in _SYMMETRIC:
             one = lever[:, j] * moment[k]
             moved.append(one if j == k else one + lever[:, k] * moment[j])
         tip = np.nan_to_num(np.stack(moved, axis=2))
-        if not np.any(tip):
+        if not any(seen) or not np.any(tip):
             continue
-        zeros = (np.zeros((size, tip.shape[1], tip.shape[2])) for size in here.sizes)
-        columns = tuple(tip if yes else none for yes, none in zip(seen, zeros, strict=True))
+        sizes = (slope.shape[0] for slope in here.motion.slopes)
+        columns = tuple(tip if yes else np.zeros((n, *tip.shape[1:])) for yes, n in zip(seen, sizes, strict=True))
         name = arm.joint_names[site - 1] if site else "the mount"
         shown = name if alone else (f"{arm.name}.{name}" if site else f"the mount of {arm.name}")
         words = f"the moment that {shown} carries, in all directions"
-        yield Cause("moment", shown, arm.name, words, f"compliance on {shown}", _SECOND_LOAD, columns)
+        yield Cause("moment", shown, words, f"compliance on {shown}", _SECOND_LOAD, columns)
 
 
-def _of_rates(here: Records, arm: Arm, arms: Mapping[str, Arm]) -> Iterator[Cause]:
+def _of_rates(here: Records, arm: Arm) -> Iterator[Cause]:
     """Joints read before or after the measurement, which moved in between: to first order in that time.
 
     Beside it the play of all joints at once, which a delay resembles where each moved about as fast, to and fro.
     """
     names = {joint: joint_rate(joint).name for joint in arm.commanded}
-    shared = any(not names.keys().isdisjoint(other.commanded) for other in arms.values() if other is not arm)
+    shared = any(not names.keys().isdisjoint(other.commanded) for other in here.arms.values() if other is not arm)
     if shared or not all(map(here.dataset.has, names.values())):
         return
     rates = {f"{arm.name}.{joint}": np.nan_to_num(here.dataset.column(rate)) for joint, rate in names.items()}
     moved = [here.along(channel, rate[:, None]) for channel, rate in rates.items()]
     columns = tuple(np.sum(parts, axis=0) for parts in zip(*moved, strict=True))
-    which = "the joints" if len(arms) == 1 else f"the joints of {arm.name}"
+    which = "the joints" if len(here.arms) == 1 else f"the joints of {arm.name}"
     words = f"how fast {which} moved: they were read at another time than the measurement was made"
     effect = "delay on all joints, or synchronise the clocks of joints and instrument"
     measure = "repeat some poses at rest, where a delay has no effect"
-    yield Cause("delay", "", arm.name, words, effect, measure, columns, ("joints",), "s")
+    yield Cause("delay", "", words, effect, measure, columns, ("joints",), "s")
     played = [here.along(channel, -np.sign(rate)[:, None]) for channel, rate in rates.items()]
     columns = tuple(np.concatenate(parts, axis=2) for parts in zip(*played, strict=True))
     words, effect = f"which way {which} moved, each along its own motion", "approach_backlash on all joints"
     measure = "move through the same poses slowly and fast: play stays, what a delay does grows with the rates"
-    yield Cause("approach", "all joints", arm.name, words, effect, measure, columns)
+    yield Cause("approach", "all joints", words, effect, measure, columns)
+
+
+def _of_mistakes(here: Records) -> Iterator[Cause]:
+    """Mistakes with an instrument that come slowly, or once."""
+    parameters, measurements = here.problem.parameters, here.problem.blueprint.measurements
+    for name, measurement in measurements.items():
+        for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
+            if one.course == "always" or np.ptp(here.order) <= 0:
+                continue
+            blocks = [parameters[f"{name}.{p}"] for p in one.parameters]
+            shares = [float(block.nominal[0]) if one.together else 1.0 for block in blocks]
+            own = [[share * part for part in here.moves[b.name]] for share, b in zip(shares, blocks, strict=True)]
+            columns = [np.concatenate(parts, axis=2) for parts in zip(*own, strict=True)]
+            moved = [part.sum(axis=2, keepdims=True) for part in columns] if one.together else columns
+            subject, words = (name, f"{name}: {one.words}") if len(measurements) > 1 else ("", one.words)
+            if one.course == "slowly":
+                labels, unit = (("change",), "1") if one.together else ((), "")
+                course = tuple(move * (here.rank / max(len(here.rank) - 1, 1) - 0.5)[:, None] for move in moved)
+                yield Cause(one.kind, subject, words, "", one.measure, course, labels, unit)
+            else:
+                for when, jump in here.jumps(moved, _MOST_SLIPS):
+                    yield Cause(one.kind, subject, f"{when}: {words}", "", one.measure, jump, jumps=True)
+
+
+def _of_loads(here: Records) -> Iterator[Cause]:
+    if here.motion.by_load:
+        by_load = [slope.transpose(0, 2, 1) for slope in here.motion.by_load]  # n_r x N x (gravity's turn, size, load)
+        level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
+        weigh = "weigh what hangs on the tool"
+        turns = tuple(f"turned about {axis}" for axis in _AXES)
+        gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
+        words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
+        yield Cause("gravity", "", words, effect, level, gravity, turns, "rad")
+        words = "the size of gravity, or of all masses together"
+        yield Cause("gravity", "size", words, "statics.gravity_m_s2", weigh, size, ("share",), "1")
+        yield Cause("load", "", "a load at the tool that is not stated", "statics.payload_g", weigh, load)
+
+
+def _of_instrument(here: Records) -> Iterator[Cause]:
+    if not any(np.any(position) for position in here.positions):
+        return
+    sizes, known = (
+        [s.shape[0] for s in here.motion.slopes],
+        "measure a known length along each axis with the instrument",
+    )
+
+    def columns(*entries: tuple[int, int]) -> tuple[Array, ...]:
+        """What is read along one axis grows with the coordinate on another: one column for each such pair."""
+        parts = [np.zeros((size, len(here.dataset), len(entries))) for size in sizes]
+        for part, own in zip(parts, here.positions, strict=True):
+            for k, (row, other) in enumerate(entries if len(own) else ()):
+                part[row, :, k] = -own[other]
+        return tuple(parts)
+
+    together = tuple(np.sum(part, axis=2, keepdims=True) for part in columns((0, 0), (1, 1), (2, 2)))
+    words = "the instrument's scale, along all axes alike"
+    yield Cause("scale", "", words, "", known, together, ("share",), "1")
+    for i, axis in enumerate(_AXES):
+        words = f"the instrument's scale along {axis}"
+        yield Cause("scale", axis, words, "", known, columns((i, i)), ("share",), "1")
+    words, pairs = "the instrument's axes, which are not at right angles", ((0, 1), (0, 2), (1, 2))
+    labels = tuple(f"between {_AXES[i]} and {_AXES[j]}" for i, j in pairs)
+    yield Cause("scale", "axes", words, "", known, columns(*pairs), labels, "rad")
+
+
+def _of_steps(here: Records) -> Iterator[Cause]:
+    once = np.ones((len(here.dataset), 1))
+    shifts, effect = here.axes(once), "the records before and after as groups of their own"
+    whole = [("what is measured jumps there as a whole", shifts)]
+    if any(map(np.any, here.positions)):
+        turned = tuple(np.concatenate([shift, np.zeros((*shift.shape[:2], 3))], axis=2) for shift in shifts)
+        for part, own in zip(turned, here.positions, strict=True):
+            if len(own):
+                part[:3, :, -3:] = np.stack([np.cross(axis, own, axisc=0, axisb=0) for axis in np.eye(3)], axis=2)
+        whole.append(("what is measured jumps there as a whole, and turns", turned))
+    for words, columns in whole:
+        for when, jump in here.jumps(columns, _MOST_STEPS):
+            yield Cause("step", "", f"{when}: {words}", effect, _STEP_MEASURE, jump, jumps=True)
+    for channel in here.motion.channels:
+        shown, si = here.shown(channel), here.si(channel)
+        for when, slip in here.jumps(here.along(channel, once), _MOST_SLIPS):
+            words = f"{when}: {shown} slips there"
+            yield Cause("slip", shown, words, "", _STEP_MEASURE, slip, ("slip",), si, jumps=True)
+
+
+def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
+    """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
+
+    Not what it does read: the noise of that would be taken for a scale.
+    """
+    positions = []
+    for kernel, off in zip(problem.kernels, problem.residuals(values), strict=True):
+        channels = kernel.factor.position_channels
+        read = bool(channels) and all(map(dataset.has, channels))
+        positions.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
+    return tuple(positions)
 
 
 def _stated(feature: Array) -> Array:
@@ -474,149 +581,22 @@ def _centred(features: Array, command: Array) -> Array:
     return centred
 
 
-def scatter_features(here: Records, place: Array) -> Iterator[tuple[str, Array]]:
-    """On what the scatter may depend, in words; ``place`` is what instruments read (3 x N; m), or nothing (0 x N)."""
-    yield "the recorded order", recorded_order(here.dataset)
-    for axis, coordinate in zip("xyz", place, strict=False):
+def scatter_features(here: Records) -> Iterator[tuple[str, Array]]:
+    """On what the scatter may depend, in words; of the positions those of the first instrument that reads some."""
+    yield "the recorded order", here.order
+    place = next((own for own in here.positions if len(own)), np.zeros((0, len(here.dataset))))
+    for axis, coordinate in zip(_AXES, place, strict=False):
         yield f"the coordinate {axis}", coordinate
     if len(place):
         yield "the distance from the instrument", np.linalg.norm(place, axis=0)
     for channel in here.motion.channels:
-        joint = channel.rpartition(".")[2]
-        command = np.nan_to_num(here.dataset.column(channel))
+        joint, command = channel.rpartition(".")[2], np.nan_to_num(here.dataset.column(channel))
         yield f"the command of {joint}", command
-        yield (
-            f"how far {joint} is from the middle of its commands",
-            np.abs(command - (command.min() + command.max()) / 2),
-        )
+        middle = (command.min() + command.max()) / 2
+        yield f"how far {joint} is from the middle of its commands", np.abs(command - middle)
     for loads in here.motion.loads.values():
         for number, effort in enumerate(loads.efforts, start=1):
             yield f"the load on joint {number}", np.abs(np.nan_to_num(effort))
-
-
-_MOST_STEPS, _MOST_SLIPS = 40, 12
-"""Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
-_FEWEST_APART = 4
-_LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
-"""Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
-_STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
-
-
-def _outside(here: Records, problem: Problem, positions: Sequence[Array], moves: Moves) -> Iterator[Cause]:
-    motion = here.motion
-    yield from _of_mistakes(here, problem, moves)
-    if motion.by_load:
-        by_load = [slope.transpose(0, 2, 1) for slope in motion.by_load]  # n_r x N x (gravity's turn, size, load)
-        level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
-        weigh = "weigh what hangs on the tool"
-        turns = tuple(f"turned about {axis}" for axis in _AXES)
-        gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
-        words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
-        yield Cause("gravity", "", "", words, effect, level, gravity, turns, "rad")
-        words = "the size of gravity, or of all masses together"
-        yield Cause("gravity", "size", "", words, "statics.gravity_m_s2", weigh, size, ("share",), "1")
-        words = "a load at the tool that is not stated"
-        yield Cause("load", "", "", words, "statics.payload_g", weigh, load)
-    yield from _of_instrument(here, positions)
-    yield from _of_steps(here, problem, positions)
-
-
-def _of_instrument(here: Records, read: Sequence[Array]) -> Iterator[Cause]:
-    if not any(np.any(position) for position in read):
-        return
-    zeros = [np.zeros((size, len(here.dataset), 1)) for size in here.sizes]
-
-    def columns(*entries: tuple[int, int]) -> tuple[Array, ...]:
-        """What is read along one axis grows with the coordinate on another: one column for each such pair."""
-        parts = []
-        for own, zero in zip(read, zeros, strict=True):
-            part = np.repeat(zero, len(entries), axis=2)
-            for k, (row, other) in enumerate(entries if len(own) else ()):
-                part[row, :, k] = -own[other]
-            parts.append(part)
-        return tuple(parts)
-
-    known = "measure a known length along each axis with the instrument"
-    together = tuple(np.sum(part, axis=2, keepdims=True) for part in columns((0, 0), (1, 1), (2, 2)))
-    words = "the instrument's scale, along all axes alike"
-    yield Cause("scale", "", "", words, "", known, together, ("share",), "1")
-    for i, axis in enumerate(_AXES):
-        words = f"the instrument's scale along {axis}"
-        yield Cause("scale", axis, "", words, "", known, columns((i, i)), ("share",), "1")
-    words = "the instrument's axes, which are not at right angles"
-    labels = tuple(f"between {_AXES[i]} and {_AXES[j]}" for i, j in ((0, 1), (0, 2), (1, 2)))
-    yield Cause("scale", "axes", "", words, "", known, columns((0, 1), (0, 2), (1, 2)), labels, "rad")
-
-
-def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
-    """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
-
-    Not what it does read: the noise of that would be taken for a scale.
-    """
-    positions = []
-    for kernel, off in zip(problem.kernels, problem.residuals(values), strict=True):
-        channels = kernel.factor.position_channels
-        read = bool(channels) and all(map(dataset.has, channels))
-        positions.append(np.nan_to_num(dataset.stacked(channels) - off[:3]) if read else np.zeros((0, len(dataset))))
-    return tuple(positions)
-
-
-def _of_steps(here: Records, problem: Problem, read: Sequence[Array]) -> Iterator[Cause]:
-    order = recorded_order(here.dataset)
-    if np.ptp(order) <= 0:
-        return
-    ids = [here.dataset.ids[i] for i in np.argsort(order, kind="stable")]
-    rank = np.argsort(np.argsort(order, kind="stable"), kind="stable")
-    turns = [np.zeros((size, len(rank), 3)) for size in here.sizes]
-    for part, own in zip(turns, read, strict=True):
-        part[: len(own)] = np.stack([np.cross(axis, own, axisc=0, axisb=0) for axis in np.eye(3)], 2) if len(own) else 0
-    for place in _places(len(rank), _MOST_STEPS):
-        after = (rank >= place).astype(float)[:, None]
-        words = f"whether a record was measured before or after {ids[place]}: what is measured jumps there as a whole"
-        effect, shifts = "the records before and after as groups of their own", here.axes(after)
-        yield Cause("step", "", "", words, effect, _STEP_MEASURE, shifts, jumps=True)
-        if any(map(np.any, turns)):
-            both = tuple(np.concatenate(p, axis=2) for p in zip(shifts, (t * after for t in turns), strict=True))
-            yield Cause("step", "", "", f"{words}, and turns", effect, _STEP_MEASURE, both, jumps=True)
-    for channel in here.motion.channels:
-        arm, _, joint = channel.partition(".")
-        shown = shown_joint(channel, problem.blueprint.arms)
-        si = "rad" if problem.blueprint.arms[arm].commanded[joint] == "angle" else "m"
-        for place in _places(len(rank), _MOST_SLIPS):
-            along = here.along(channel, (rank >= place).astype(float)[:, None])
-            words = f"whether a record was measured before or after {ids[place]}: {shown} slips there"
-            yield Cause("slip", shown, arm, words, "", _STEP_MEASURE, along, ("slip",), si, jumps=True)
-
-
-def _of_mistakes(here: Records, problem: Problem, moves: Moves) -> Iterator[Cause]:
-    order, many = recorded_order(here.dataset), len(problem.blueprint.measurements) > 1
-    ranked = np.argsort(order, kind="stable")
-    rank = np.argsort(ranked, kind="stable")
-    for name, measurement in problem.blueprint.measurements.items():
-        for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
-            if one.course == "always":
-                continue
-            blocks = [problem.parameters[f"{name}.{p}"] for p in one.parameters]
-            shares = [float(block.nominal[0]) if one.together else 1.0 for block in blocks]
-            own = [[share * part for part in moves[b.name]] for share, b in zip(shares, blocks, strict=True)]
-            columns = [np.concatenate(parts, axis=2) for parts in zip(*own, strict=True)]
-            moved = [part.sum(axis=2, keepdims=True) for part in columns] if one.together else columns
-            subject, words = (name if many else ""), f"{name}: {one.words}" if many else one.words
-            labels, unit = (("change",), "1") if one.together and one.course != "once" else ((), "")
-            if np.ptp(order) > 0 and one.course == "slowly":
-                course = tuple(move * (rank / max(len(rank) - 1, 1) - 0.5)[:, None] for move in moved)
-                yield Cause(one.kind, subject, "", words, "", one.measure, course, labels, unit)
-            elif np.ptp(order) > 0:
-                for place in _places(len(rank), _MOST_SLIPS):
-                    jump = tuple(move * (rank >= place)[:, None] for move in moved)
-                    at = f"whether a record was measured before or after {here.dataset.ids[ranked[place]]}: {words}"
-                    yield Cause(one.kind, subject, "", at, "", one.measure, jump, jumps=True)
-
-
-def _places(count: int, most: int) -> list[int]:
-    inner = np.arange(_FEWEST_APART, count - _FEWEST_APART + 1)
-    step = max(_FEWEST_APART, -(-len(inner) // most))
-    return [int(i) for i in inner[step // 2 :: step]]
 
 
 WILD = 3.0  # A record farther off than so many medians counts as one that is as far off

@@ -9,8 +9,8 @@ stretch is never judged by the records it comes from: each fold of a cross-valid
 scores of the other folds give (cross-conformal [Vovk2015]).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ from scipy.special import betainc
 
 from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices
-from armcal.base.dataset import Dataset
 from armcal.base.settings import Settings
 from armcal.base.units import readable
 from armcal.diagnose.causes import MOST_LEVELS
@@ -38,15 +37,16 @@ from armcal.estimate.prediction import (
 )
 from armcal.estimate.robust import WeighedFit, Weighing, fit
 from armcal.estimate.uncertainty import automatic_block_length, standard_error_of_mean
-from armcal.estimate.validation import FitTask, JudgedFit, Recording, Split, fit_and_judge, judged_fit, judging
+from armcal.estimate.validation import FitTask, JudgedFit, Recording, fit_and_judge, judged_fit, judging
 from armcal.estimate.variance import apply_components
 from armcal.problem.problem import Problem
 
-Residuals = tuple[Array, ...]  # Raw residuals, one (n_r x N) a factor
+Residuals = Sequence[Array]  # Raw residuals, one (n_r x N) a factor
 FEWEST = 40  # Judged records for a stretch to be found
 LEVEL = 0.005
 _MM = 1000.0
 _MEANT = {"same": "", "new": " without the known drift, as in a new recording,"}
+_RADIUS = "radius_95"
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,16 @@ class Scores:
 
     errors: Array  # residual numbers over their standard deviations, all factors stacked (n_r x N)
     reaches: Array  # lengths of position residuals over their 95 % radii, one row a position factor (n_p x N)
-    freedom: Array  # degrees of freedom of the fit that judged each record (N)
+    freedom: float | Array  # degrees of freedom of the fit that predicted them
 
     def of_level(self, level: float) -> Array:
         return np.asarray(np.abs(self.errors) / quantile(level, self.freedom))
+
+    @property
+    def by_name(self) -> dict[str, tuple[float, Array]]:
+        """Each level with the sizes of what was missed in its half widths, then 95 % with those in radii."""
+        levels = {level_name(level): (level, self.of_level(level)) for level in LEVELS}
+        return {**levels, _RADIUS: (RADIUS_LEVEL, self.reaches)}
 
     @property
     def judged(self) -> Array:
@@ -130,10 +136,6 @@ def missed(by: Predictor, held: Problem) -> dict[Recording, Residuals]:
     }
 
 
-def score(by: Predictor, held: Problem) -> dict[Recording, Scores]:
-    return {name: scored(held, own, by.spreads(held, name)) for name, own in missed(by, held).items()}
-
-
 def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) -> Scores:
     errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
@@ -141,9 +143,7 @@ def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) ->
         for kernel, residual, spread in zip(problem.kernels, residuals, spreads, strict=True)
         if is_position(kernel)
     ]
-    count = residuals[0].shape[1]
-    freedom = np.full(count, max(spreads[0].freedom, 1))
-    return Scores(np.vstack(errors), np.array(reaches).reshape(-1, count), freedom)
+    return Scores(np.vstack(errors), np.array(reaches).reshape(-1, problem.count), max(spreads[0].freedom, 1))
 
 
 def whitened_like(held: Problem, fitted: WeighedFit, estimator: Estimator) -> Problem:
@@ -169,43 +169,47 @@ def besides(scores: Scores, places: Indices) -> Scores:
     return replace(scores, errors=errors)
 
 
-def _collected(
-    splits: Sequence[Split], residuals: Sequence[Mapping[Recording, Residuals]], count: int
-) -> dict[Recording, Residuals]:
-    result: dict[Recording, Residuals] = {}
-    for split, held_residuals in zip(splits, residuals, strict=True):
-        for name, own in held_residuals.items():
-            whole = result.setdefault(name, tuple(np.full((len(rows), count), np.nan) for rows in own))
-            for mine, rows in zip(whole, own, strict=True):
-                mine[:, split.holdout] = rows
-    return result
-
-
 def stretch(scores: Scores) -> Stretch | None:
     """From the scores of records that no other stretch comes from; None if there are too few.
 
-    Of n scores the ceil((n + 1) p)-th smallest: the finite-sample quantile of [Lei2018].
+    Of n scores the ceil((n + 1) p)-th smallest, or the largest: the finite-sample quantile of [Lei2018].
     """
-    judged = scores.judged
+    judged, ranked = scores.judged, dict[str, float]()
     if judged.sum() < FEWEST:
         return None
-    rank = {level_name(level): _ranked(scores.of_level(level)[:, judged].ravel(), level) for level in LEVELS}
-    reaches = scores.reaches[:, judged].ravel()
-    radius = _ranked(reaches, RADIUS_LEVEL) if np.isfinite(reaches).any() else None
-    return Stretch(coordinates=rank, radius=radius)
+    for name, (level, sizes) in scores.by_name.items():
+        ordered = np.sort(sizes[:, judged][np.isfinite(sizes[:, judged])])
+        if len(ordered):
+            ranked[name] = float(ordered[min(int(np.ceil((len(ordered) + 1) * level)), len(ordered)) - 1])
+    return Stretch(radius=ranked.pop(_RADIUS, None), coordinates=ranked)
 
 
-def coverage(scores: Scores, stretches: Sequence[Stretch | None] | None = None) -> Coverage | None:
+def coverage(scores: Scores, stretches: Sequence[Stretch | None] = ()) -> Coverage | None:
     """Shares held by the intervals of judged records (None if there are none), widened by each record's stretch."""
     judged = np.flatnonzero(scores.judged)
     if not len(judged):
         return None
-    none = [Stretch(coordinates={level_name(level): 1.0 for level in LEVELS}, radius=1.0)] * len(scores.freedom)
-    own = list(stretches or ())
-    known = bool(own) and all(own[i] is not None for i in judged)
-    shares = _shares(scores, own, judged) if known else None
-    held = _held(scores, own if known else none, STATED)[:, judged]
-    return Coverage(len(judged), int(np.isfinite(held).sum()), _shares(scores, none, judged), shares, _worth(held))
+    each = [stretches[i] for i in judged] if len(stretches) else []
+    widened = {_RADIUS: [np.nan if s is None or s.radius is None else s.radius for s in each]}
+    known = bool(each) and all(each)
+    if known:
+        widened |= {level_name(p): [s.coordinates[level_name(p)] for s in each if s] for p in LEVELS}
+
+    def held(by_stretches: bool) -> dict[str, Array]:
+        """Whether each number lies within its interval (n x N each): one, zero, or nan where there is none."""
+        return {
+            name: np.where(np.isfinite(sizes), sizes <= (np.array(widened[name]) if by_stretches else 1.0), np.nan)
+            for name, sizes in ((name, sizes[:, judged]) for name, (_, sizes) in scores.by_name.items())
+        }
+
+    raw, within = held(False), held(known)
+    shares, stretched = (
+        {name: float(np.nanmean(one)) if np.isfinite(one).any() else None for name, one in of.items()}
+        for of in (raw, within)
+    )
+    stated = within[level_name(STATED)]
+    count = int(np.isfinite(stated).sum())
+    return Coverage(len(judged), count, shares, stretched if known else None, _worth(stated))
 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
@@ -224,30 +228,6 @@ def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -
     if share > STATED:
         return Finding("note", f"{text}: wider than necessary.", test)
     return Finding("warning", f"{text}: too narrow.", test, "Take the measured shares for what a +- is worth.")
-
-
-def _ranked(scores: Array, level: float) -> float:
-    """The ceil((n + 1) p)-th smallest of those that there are, or the largest."""
-    ordered = np.sort(scores[np.isfinite(scores)])
-    return float(ordered[min(int(np.ceil((len(ordered) + 1) * level)), len(ordered)) - 1])
-
-
-def _held(scores: Scores, stretches: Sequence[Stretch | None], level: float) -> Array:
-    """Whether each number lies within its interval (n_r x N): one, zero, or nan where there is none."""
-    factors = np.array([np.nan if s is None else s.coordinates[level_name(level)] for s in stretches])
-    return _within(scores.of_level(level), factors)
-
-
-def _shares(scores: Scores, stretches: Sequence[Stretch | None], judged: Indices) -> Shares:
-    shares: Shares = {level_name(p): float(np.nanmean(_held(scores, stretches, p)[:, judged])) for p in LEVELS}
-    if not np.isfinite(scores.reaches[:, judged]).any():
-        return {**shares, "radius_95": None}
-    radii = np.array([np.nan if s is None or s.radius is None else s.radius for s in stretches])
-    return {**shares, "radius_95": float(np.nanmean(_within(scores.reaches, radii)[:, judged]))}
-
-
-def _within(scores: Array, limits: Array) -> Array:
-    return np.where(np.isfinite(scores), scores <= limits, np.nan)
 
 
 def _worth(held: Array) -> float:
@@ -269,168 +249,129 @@ def predictions(fit: Fit) -> Predictor:
     return predictor(fit.fitted)
 
 
-_NAMED: Mapping[Recording, str] = {"same": "same_recording", "new": "new_recording"}
-
-
 @dataclass(frozen=True)
-class IntervalResult:
-    """Prediction intervals of a run, each by recording: the calibration's own, and where something drifts a new one.
+class Intervals:
+    """Prediction intervals of one recording, the calibration's own or a new one.
 
     Attributes:
-        stretches: what half widths are multiplied by, from cross-validation; empty without.
+        stretch: what half widths are multiplied by, from cross-validation; None without.
         crossed: shares held of training records, by folds that did not see them; stretched from the other folds.
         half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
-        scores: of cross-validated and held-out records, in dataset order; nan elsewhere.
     """
 
-    stretches: Mapping[Recording, Stretch] = field(default_factory=dict)
-    crossed: Mapping[Recording, Coverage] = field(default_factory=dict)
-    holdout: Mapping[Recording, Coverage] = field(default_factory=dict)  # shares held of held-out records
-    half_width_mm: Mapping[Recording, float] = field(default_factory=dict)
-    radius_mm: Mapping[Recording, float] = field(default_factory=dict)  # of 95 % radii of positions, likewise
-    scores: Mapping[Recording, Scores] = field(default_factory=dict)
-    levels: int = 0  # each joint stood at no more angles than these, and nothing states its error between them; else 0
-
-    @property
-    def judged(self) -> tuple[Mapping[Recording, Coverage], str]:
-        """What judges best, and what it is in words: held-out records, else cross-validated ones."""
-        return (self.holdout, "held-out records") if self.holdout else (self.crossed, "cross-validated records")
-
-    def findings(self) -> list[Finding]:
-        coverages, words = self.judged
-        state = (
-            "State what the joints are off between those angles as arms.NAME.joint_noise_deg, or measure poses between."
-        )
-        typical = [Finding("note", self._typical(), "", state if self.levels else "")] if self.half_width_mm else []
-        return [*typical, *(coverage_finding(own, words, name) for name, own in coverages.items())]
-
-    def _typical(self) -> str:
-        half, radius = self.half_width_mm, self.radius_mm
-        first: Recording = "new" if "new" in half else "same"
-        text = "In the median pose, of poses like the recorded ones, a prediction is good to "
-        text += f"+- {readable(half[first])} mm a coordinate (90 %), "
-        text += f"{readable(radius[first])} mm in all (95 %)"
-        if first == "new":
-            text += f"; within this recording to +- {readable(half['same'])} mm and {readable(radius['same'])} mm"
-        text += ", the measurement's noise included."
-        if self.levels:
-            text += f" Each joint stood at {self.levels} angles at most: what it is off between them is not included."
-        return text
+    stretch: Stretch | None
+    crossed: Coverage | None
+    holdout: Coverage | None  # shares held of held-out records
+    half_width_mm: float | None  # None without positions
+    radius_mm: float | None  # of 95 % radii of positions, likewise
 
     def as_dict(self) -> dict[str, Any]:
-        content = {}
-        for name in self.half_width_mm:
-            content[_NAMED[name]] = {
-                "half_width_90_mm": self.half_width_mm[name],
-                "radius_95_mm": self.radius_mm[name],
-                "stretch": {**own.coordinates, "radius_95": own.radius} if (own := self.stretches.get(name)) else None,
-                "cross_validated": self.crossed[name].as_dict() if name in self.crossed else None,
-                "holdout": self.holdout[name].as_dict() if name in self.holdout else None,
-            }
-        return content
+        return {
+            "half_width_90_mm": self.half_width_mm,
+            "radius_95_mm": self.radius_mm,
+            "stretch": self.stretch and {**self.stretch.coordinates, _RADIUS: self.stretch.radius},
+            "cross_validated": self.crossed and self.crossed.as_dict(),
+            "holdout": self.holdout and self.holdout.as_dict(),
+        }
 
 
-def intervals(fit: Fit) -> IntervalResult:
-    """How wide prediction intervals are; nothing of a fit that did not converge."""
+def intervals(fit: Fit) -> dict[Recording, Intervals]:
+    """How wide prediction intervals are, by recording: the calibration's own, and where something drifts a new one.
+
+    Nothing of a fit that did not converge.
+    """
     problem, split = fit.problem, fit.split
     if not fit.converged or problem.blueprint.groups:
-        return IntervalResult()  # a contact reads nothing that could be predicted
+        return {}  # a contact reads nothing that could be predicted
     by, alike = fit.of(predictions), whitened_like(problem, fit.fitted, fit.estimator)
-    scores, shares, stretches = _crossed(fit)
-    holdout: dict[Recording, Coverage] = {}
-    if len(split.holdout):
-        for name, own in score(by, alike.subset(split.holdout)).items():
-            shares_held = coverage(own, [stretches.get(name)] * len(split.holdout))
-            if shares_held is not None:
-                holdout[name] = shares_held
-            scores = {**scores, name: _filled(scores.get(name), own, split.holdout, len(fit.dataset))}
-    spreads: dict[Recording, Sequence[Spread]] = {"same": by.spreads(alike, "same")}
-    if by.drift is not None:
-        spreads["new"] = by.spreads(alike, "new")
     places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
-    typical = {
-        name: _typical([spread[i].of(POSITION) for i in places], stretches.get(name))
-        for name, spread in spreads.items()
-    }
-    return IntervalResult(
-        stretches,
-        shares,
-        holdout,
-        {name: half for name, (half, _) in typical.items()} if places else {},
-        {name: radius for name, (_, radius) in typical.items()} if places else {},
-        scores,
-        _levels(problem, fit.dataset),
-    )
+    held_out, trained = alike.subset(split.holdout) if len(split.holdout) else None, _crossed(fit)
+    unseen = {} if held_out is None else missed(by, held_out)
+    result = dict[Recording, Intervals]()
+    names: tuple[Recording, ...] = ("same",) if by.drift is None else ("same", "new")
+    for name in names:
+        crossed, holdout, widened = None, None, None
+        if name in trained:
+            others: list[Stretch | None] = [None] * len(split.train)
+            for part in fit.ready.folds:
+                apart = stretch(besides(trained[name], part.holdout))
+                for i in part.holdout:
+                    others[i] = apart
+            crossed = coverage(trained[name], others)
+            # Nothing is stretched whose share was not judged.
+            widened = stretch(trained[name]) if crossed and crossed.stretched else None
+        if held_out is not None:
+            scores = scored(held_out, unseen[name], by.spreads(held_out, name))
+            holdout = coverage(scores, [widened] * len(split.holdout))
+        half = radius = None
+        if places:
+            whole = by.spreads(alike, name)
+            spreads = [whole[i].of(POSITION) for i in places]
+            half = _MM * float(np.median(np.concatenate([spread.half_widths(STATED).ravel() for spread in spreads])))
+            half *= widened.coordinates[level_name(STATED)] if widened else 1.0
+            radius = _MM * float(np.median(np.concatenate([spread.radius() for spread in spreads])))
+            radius *= widened.radius if widened and widened.radius is not None else 1.0
+        result[name] = Intervals(widened, crossed, holdout, half, radius)
+    return result
 
 
-def _levels(problem: Problem, dataset: Dataset) -> int:
+def _levels(fit: Fit) -> int:
     """The most angles at which any turning joint stood; 0 where they are many, or an arm states its joints' noise."""
-    arms = problem.blueprint.arms
+    arms = fit.problem.blueprint.arms
     channels = [channel for channel, dimension in command_channels(arms).items() if dimension == "angle"]
-    counts = [len(np.unique(np.round(dataset.column(channel), 9))) for channel in channels]
-    most = max(counts, default=0)
+    most = max((len(np.unique(np.round(fit.dataset.column(channel), 9))) for channel in channels), default=0)
     return most if most <= MOST_LEVELS and not any(arm.joint_noise for arm in arms.values()) else 0
 
 
-def _crossed(
-    fit: Fit,
-) -> tuple[dict[Recording, Scores], dict[Recording, Coverage], dict[Recording, Stretch]]:
-    """Scores in dataset order, the shares they hold by stretches of other folds, and the stretches from all of them.
+def _crossed(fit: Fit) -> dict[Recording, Scores]:
+    """Scores of training records, by recording; none without folds.
 
     Residuals of the folds are put in units of what the whole fit would have predicted for the record: a fold with fewer
     records claims less, and by its own claims would let the whole fit claim too much.
     """
-    if fit.crossed is None:
-        return {}, {}, {}
-    by, fitted, split, folds = fit.of(predictions), fit.fitted, fit.split, fit.ready.folds
-    held_residuals = _collected(folds, [one.held_residuals for one in fit.crossed.fits], len(split.train))
+    by, problem, folds = fit.of(predictions), fit.fitted.problem, fit.ready.folds
+    fits = fit.crossed.fits if fit.crossed is not None else ()
+
+    def together(parts: Iterable[Sequence[Array] | None], missing: float) -> tuple[Array, ...] | None:
+        """Of all records (N, ...), from those that each fold held out; None where no fold has any."""
+        whole: tuple[Array, ...] | None = None
+        for part, fold in zip(parts, folds, strict=True):
+            if part is not None:
+                whole = whole or tuple(np.full((problem.count, *block.shape[1:]), missing) for block in part)
+                for every, block in zip(whole, part, strict=True):
+                    every[fold.holdout] = block
+        return whole
+
     # What the pose residuals of folds did not know of the records that they did not see; None without any.
-    unknown: list[Array] | None = None
-    for one, fold in zip(fit.crossed.fits, folds, strict=True):
-        if one.unknown is None:
-            continue
-        if unknown is None:
-            unknown = [np.zeros((fitted.problem.count, *block.shape[1:])) for block in one.unknown]
-        for whole, block in zip(unknown, one.unknown, strict=True):
-            whole[fold.holdout] = block
-    scores = {
-        name: scored(fitted.problem, own, by.left_out(fitted.problem, name, unknown))
-        for name, own in held_residuals.items()
-    }
-    shares: dict[Recording, Coverage] = {}
-    for name, own in scores.items():
-        others: list[Stretch | None] = [None] * len(split.train)
-        for part in folds:
-            apart = stretch(besides(own, part.holdout))
-            for i in part.holdout:
-                others[i] = apart
-        share = coverage(own, others)
-        if share is not None:
-            shares[name] = share
-    # Nothing is stretched whose share was not judged.
-    sure = [name for name, share in shares.items() if share.stretched is not None]
-    stretches = {name: s for name in sure if (s := stretch(scores[name])) is not None}
-    return {n: _filled(None, own, split.train, len(fit.dataset)) for n, own in scores.items()}, shares, stretches
-
-
-def _filled(before: Scores | None, own: Scores, places: Indices, count: int) -> Scores:
-    result = before
-    if result is None:
-        errors, reaches = (np.full((len(rows), count), np.nan) for rows in (own.errors, own.reaches))
-        result = Scores(errors, reaches, np.ones(count))
-    result.errors[:, places], result.reaches[:, places], result.freedom[places] = own.errors, own.reaches, own.freedom
-    return result
-
-
-def _typical(spreads: Sequence[Spread], widened: Stretch | None) -> tuple[float, float]:
-    if not spreads:
-        return float("nan"), float("nan")
-    factor = widened.coordinates[level_name(STATED)] if widened else 1.0
-    radius = widened.radius if widened and widened.radius is not None else 1.0
-    half = np.concatenate([spread.half_widths(STATED).ravel() for spread in spreads])
-    radii = np.concatenate([spread.radius() for spread in spreads])
-    return float(np.median(half)) * factor * _MM, float(np.median(radii)) * radius * _MM
+    unknown, scores = together([one.unknown for one in fits], 0.0) if fits else None, dict[Recording, Scores]()
+    for name in dict.fromkeys(name for one in fits for name in one.held_residuals):
+        parts = [[rows.T for rows in one.held_residuals[name]] if one.held_residuals else None for one in fits]
+        residuals = [rows.T for rows in together(parts, np.nan) or ()]
+        scores[name] = scored(problem, residuals, by.left_out(problem, name, unknown))
+    return scores
 
 
 def covered(fit: Fit) -> list[Finding]:
-    return fit.of(intervals).findings()
+    """How good a prediction is in the median pose, and whether intervals hold their shares.
+
+    Held-out records judge best, else cross-validated ones.
+    """
+    own, findings = fit.of(intervals), list[Finding]()
+    half, radius = ({name: getattr(one, of) for name, one in own.items()} for of in ("half_width_mm", "radius_mm"))
+    first: Recording = "new" if "new" in own else "same"
+    if half.get(first) is not None:
+        text = "In the median pose, of poses like the recorded ones, a prediction is good to "
+        text += f"+- {readable(half[first])} mm a coordinate (90 %), {readable(radius[first])} mm in all (95 %)"
+        if first == "new":
+            text += f"; within this recording to +- {readable(half['same'])} mm and {readable(radius['same'])} mm"
+        text += ", the measurement's noise included."
+        action = ""
+        if levels := _levels(fit):
+            text += f" Each joint stood at {levels} angles at most: what it is off between them is not included."
+            action = "State what the joints are off between those angles as arms.NAME.joint_noise_deg, or measure "
+            action += "poses between."
+        findings.append(Finding("note", text, "", action))
+    held = any(one.holdout for one in own.values())
+    words = "held-out records" if held else "cross-validated records"
+    judged = {name: one.holdout if held else one.crossed for name, one in own.items()}
+    return findings + [coverage_finding(shares, words, name) for name, shares in judged.items() if shares]

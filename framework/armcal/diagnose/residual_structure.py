@@ -234,17 +234,16 @@ def structure(fit: Fit) -> ResidualStructure | None:
         return None
     problem, dataset, position = problem.subset(chosen), dataset.subset(chosen), position[chosen]
     rows, read = FitRows.of(problem, estimate), predicted_positions(problem, estimate.values, dataset)
-    here = Records(dataset, fit.motion.subset(fit.split.train[chosen]))
     moves = moves_of(problem, estimate.values, candidates(problem.parameters))
-    causes = list(causes_of(problem, here, read, moves))
+    here = Records(problem, dataset, fit.motion.subset(fit.split.train[chosen]), read, moves)
+    causes = list(causes_of(here))
     causes, columns = _named_once(problem, causes, [rows.columns(one.columns) for one in causes])
-    place = next((own for own in read if len(own)), np.zeros((0, len(dataset))))
     contest = Contest(
         rows,
         Recorded.of(problem, rows, here.motion, dataset),
         causes,
         columns,
-        [(words, f) for words, f in scatter_features(here, place) if np.ptp(f) > 1e-9 * max(1.0, np.abs(f).max())],
+        [(words, f) for words, f in scatter_features(here) if np.ptp(f) > 1e-9 * max(1.0, np.abs(f).max())],
         pose_numbers(dataset, here.motion.channels),
         np.diff(position) == 1,
     )

@@ -295,7 +295,8 @@ def cross_validate(
 def halves(problem: Problem, estimator: Estimator, start: Array) -> dict[str, Array]:
     """How far each pose that is ``Placed`` differs between fits to halves of the records as these weigh.
 
-    In mm and deg, of several divisions (K x 2), nan where a fit did not converge; empty where no such pose is free, or the records are few.
+    In mm and deg, of several divisions (K x 2; nan where a fit did not converge); empty where no such pose is free,
+    or the records are few.
     """
     named = {n: f"{n}.{m.place[0]}" for n, m in problem.blueprint.measurements.items() if isinstance(m, Placed)}
     free, count = set(problem.parameters.coordinate_names), problem.count

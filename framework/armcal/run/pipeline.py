@@ -319,7 +319,7 @@ def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | Non
     return PredictionRecord(
         entries=own.estimate.names,
         covariance=covariance_rows(own.estimate.covariance),
-        stretches=dict(own.of(intervals).stretches),
+        stretches={name: one.stretch for name, one in own.of(intervals).items() if one.stretch},
         columns={str(name): str(local) for name, local in columns.items()},
         drifts={b.name: b.drift for b in own.fitted.problem.parameters.free if b.drift is not None},
         ranges=ranges,

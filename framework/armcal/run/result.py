@@ -26,7 +26,7 @@ from armcal.calibration.calibration_file import (
 )
 from armcal.calibration.intervals import PAYLOAD, PredictionRecord
 from armcal.config.system import System
-from armcal.diagnose.coverage import IntervalResult, intervals
+from armcal.diagnose.coverage import Intervals, intervals
 from armcal.diagnose.fit import Fit, RecordErrors
 from armcal.diagnose.verdict import Verdict, evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
@@ -34,7 +34,7 @@ from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
 from armcal.estimate.prediction import residual_spread
 from armcal.estimate.uncertainty import Bootstrap
-from armcal.estimate.validation import ErrorSummary, Split, in_unit, summarise
+from armcal.estimate.validation import ErrorSummary, Recording, Split, in_unit, summarise
 from armcal.io import folder as folders
 from armcal.measure.csv_writer import csv_text
 from armcal.measure.reader import surroundings
@@ -239,8 +239,8 @@ class RunResult:
         return tuple(record for record in self.suspicious if record.weight == 0)
 
     @property
-    def intervals(self) -> IntervalResult:
-        """How wide prediction intervals are, and what they hold."""
+    def intervals(self) -> dict[Recording, Intervals]:
+        """How wide prediction intervals are, and what they hold, by recording."""
         return self.fit.of(intervals)
 
     @property
@@ -339,7 +339,11 @@ def metrics(result: RunResult) -> dict[str, Any]:
             "paragraph": verdict.paragraph,
         },
         "structure": evidence(result.fit),
-        "prediction_intervals": result.intervals.as_dict(),
+        "prediction_intervals": {
+            f"{name}_recording": own.as_dict()
+            for name, own in result.intervals.items()
+            if own.half_width_mm is not None
+        },
         "bootstrap": _bootstrap_metrics(result),
         "warnings": list(result.warnings),
         "evaluator": result.backend,
