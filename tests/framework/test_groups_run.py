@@ -130,7 +130,7 @@ def test_folds_that_leave_a_socket_out_still_judge_it(data, tmp_path):
     validation = {"folds": 5}
     instrument = {"distances": []}
     result = calibrate(Experiment.load(written(tmp_path, few, instrument, validation=validation)))
-    assert result.errors.failed_folds == 0
+    assert result.fit.crossed.failed_folds == 0
     assert np.isfinite(result.errors.cross_validated_mm).all()
 
 

@@ -216,7 +216,7 @@ def test_the_real_arm_under_every_loss(repository, shared_data, folds):
     for loss in ("none", "huber", "cauchy", "reject"):
         settings = [f"noise.loss={loss}", f"validation.folds={folds}", "evaluator=compiled"]
         done = calibrate(Experiment.load(config, settings, data))
-        assert done.estimate.verdict.converged and done.errors.failed_folds == 0
+        assert done.estimate.verdict.converged and done.fit.crossed.failed_folds == 0
         errors[loss] = done.table.calibrated["cross_validated"].mean
     assert max(errors.values()) < 1.02 * errors["none"]
     assert errors["huber"] < errors["none"]

@@ -210,18 +210,11 @@ def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
     return best[1:]
 
 
-@dataclass(frozen=True)
-class TwoFrames:
-    """Where the second frame begins (a place among the records), and what both leave (root mean square, m)."""
+def two_frames(tools: Tools, measured: Array, basis: Array) -> tuple[float, int] | None:
+    """What records (3 x n, m) in two frames leave (root mean square, m), and which of them begins the second.
 
-    begins: int
-    left: float
-
-
-def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
-    """Records (3 x n, m) in recorded order, each part aligned by itself; None where they are too few.
-
-    From a few divisions on, each part is aligned and the division put where both alignments leave least, in turn.
+    Each part is aligned by itself, from a few divisions on, and the division put where both alignments leave least, in
+    turn; None where records are too few.
     """
     every = np.arange(measured.shape[1])
     if len(every) < 2 * FEWEST_IN_PART:
@@ -236,8 +229,8 @@ def two_frames(tools: Tools, measured: Array, basis: Array) -> TwoFrames | None:
             before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
             left = before + after[-1] - after
             begins = int(np.argmin(left[FEWEST_IN_PART:-FEWEST_IN_PART])) + FEWEST_IN_PART
-            divisions.append(TwoFrames(begins, float(np.sqrt(left[begins] / len(every)))))
-    return min(divisions, key=lambda one: one.left)
+            divisions.append((float(np.sqrt(left[begins] / len(every))), begins))
+    return min(divisions)
 
 
 def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> FactorRecords:
@@ -600,14 +593,14 @@ def _of_axes(seen: _Seen, straight: Adapting) -> Iterator[tuple[str, Array]]:
 
 
 def _single(problem: Problem, seen: _Seen, arm: Arm, straight: Adapting, enough: float = np.inf) -> Iterator[_Reading]:
-    smaller = _Smaller(spread_of(straight.predicted))
+    size = spread_of(straight.predicted)
     for words, measured in _of_axes(seen, straight):
         left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
-        yield _Reading(smaller.left(left, kept_spread(measured, seen.measured)), words, False, {}, measured)
+        yield _Reading(_as_spread(left, size, kept_spread(measured, seen.measured)), words, False, {}, measured)
     spread = spread_of(seen.measured)
     for words, read_as in [*single_joints(arm), *coupled_joints(arm)]:
         left = _left(problem, seen, read_as, seen.measured, enough)
-        yield _Reading(smaller.left(left, spread), words, True, read_as, seen.measured)
+        yield _Reading(_as_spread(left, size, spread), words, True, read_as, seen.measured)
 
 
 def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
@@ -619,8 +612,8 @@ def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
     tools = tools_of(problem.with_record(number, seen.records), nominal, number)
     apart = two_frames(tools, seen.measured, seen.placing.basis)
     if apart is not None:
-        words = f"the positions from record {seen.ids[apart.begins]} on taken for those in another frame"
-        yield _Reading(apart.left, f"{words} (something moved there: calibrate both parts by themselves)", False)
+        words = f"the positions from record {seen.ids[apart[1]]} on taken for those in another frame"
+        yield _Reading(apart[0], f"{words} (something moved there: calibrate both parts by themselves)", False)
 
 
 def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
@@ -630,7 +623,7 @@ def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator
         return
     axes = [("", seen.measured), *((f" and {own}", moved) for own, moved in _of_axes(seen, straight))]
     axes = axes if seen.placing is None else axes[:2]
-    smaller, measured = _Smaller(spread_of(straight.predicted)), np.array([moved for _, moved in axes])
+    size, measured = spread_of(straight.predicted), np.array([moved for _, moved in axes])
     spreads = [kept_spread(moved, seen.measured) for moved in measured]
     for words, read_as in [*single_joints(arm), *several_joints(arm)]:
         if seen.placing is not None:
@@ -639,19 +632,16 @@ def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator
             positions = _positions(problem, seen, read_as, problem.parameters.nominal())
             lefts = [] if positions is None else positions.left_of_each(measured, enough).tolist()
         for left, spread, (own, moved) in zip(lefts, spreads, axes, strict=False):
-            yield _Reading(smaller.left(left, spread), f"{words}{own}", True, read_as, moved)
+            yield _Reading(_as_spread(left, size, spread), f"{words}{own}", True, read_as, moved)
 
 
-@dataclass(frozen=True)
-class _Smaller:
-    """How far the arm's positions are spread (m): measured ones near one point are near those of any arm."""
+def _as_spread(left: float, size: float, spread: float) -> float:
+    """What a reading leaves, as many times more as its positions are spread less than the arm's, of this ``size`` (m).
 
-    size: float
-
-    def left(self, left: float, spread: float) -> float:
-        """What a reading leaves, as many times more as its positions are spread less; infinite where it is no fit."""
-        spread = max(spread, _SMALLEST)
-        return np.inf if left > FITS * spread else left * max(1.0, self.size / spread)
+    Measured ones near one point are near those of any arm. Infinite where it is no fit.
+    """
+    spread = max(spread, _SMALLEST)
+    return np.inf if left > FITS * spread else left * max(1.0, size / spread)
 
 
 _MEND = {

@@ -39,6 +39,7 @@ from armcal.estimate.validation import (
     error_name,
     error_unit,
     errors_and_turns,
+    measures_turns,
     record_errors,
 )
 from armcal.problem.motion import Motion, recorded_position
@@ -253,7 +254,6 @@ class RecordErrors:
     position_mm: Array  # predicted tool position of the first arm in its base frame (3 x N)
     nominal_crossed_mm: Array
     rival_mm: Array
-    failed_folds: int = 0  # how many folds of the cross-validation did not converge
     at_rest_mm: Array | None = None
     cross_validated_at_rest_mm: Array | None = None  # the same by the fold that did not train on it
     residual_columns: tuple[str, ...] = ()  # names of the rows of the residuals, with their units (mm; mrad for angles)
@@ -286,65 +286,62 @@ def unconfigured(problem: Problem, name: str) -> bool:
 
 
 def _errors(fit: Fit) -> RecordErrors:
-    problem, values, train, crossed = fit.problem, fit.estimate.values, fit.split.train, fit.crossed
-    judged, judged_at_rest, judged_turns = np.full((3, len(fit.dataset)), np.nan)
+    problem, values, crossed = fit.problem, fit.estimate.values, fit.crossed
+    judged = np.full((3, len(fit.dataset)), np.nan)  # of lengths, at rest, and of turns
     if crossed is not None:
-        judged[train], judged_at_rest[train] = crossed.errors * _MM, crossed.at_rest * _MM
-        if crossed.turns is not None:
-            judged_turns[train] = np.degrees(crossed.turns)
-    (nominal, nominal_crossed, rival), before_turns, residual = _nominal(fit.before or fit, crossed is not None)
-    after = settled(problem, values)
-    errors, turns = errors_and_turns(problem, values, fit.fitted.problem)
-    turned = None
-    if turns is not None and before_turns is not None:
-        shown, shown_crossed, turn_rival = (np.degrees(of) for of in before_turns)
-        turned = TurnErrors(shown, np.degrees(turns), judged_turns, shown_crossed, turn_rival)
+        for row, own in zip(judged, (crossed.errors, crossed.at_rest, crossed.turns), strict=True):
+            row[fit.split.train] = np.nan if own is None else own
+    nominal, nominal_crossed, rival, residual = _nominal(fit.before or fit, crossed is not None)
+    after = _of_both(problem, values, fit.fitted.problem)
+    turned = (nominal[1], after[1], judged[2], nominal_crossed[1], rival[1])
+    left = problem.residuals_beside(fit.fitted.problem, settled(problem, values))
     return RecordErrors(
-        nominal_mm=nominal * _MM,
-        calibrated_mm=errors * _MM,
-        cross_validated_mm=judged,
+        nominal_mm=nominal[0] * _MM,
+        calibrated_mm=after[0] * _MM,
+        cross_validated_mm=judged[0] * _MM,
         nominal_residual_mm=_known(residual, problem) * _MM,
-        calibrated_residual_mm=_known(problem.residuals_beside(fit.fitted.problem, after), problem) * _MM,
+        calibrated_residual_mm=_known(left, problem) * _MM,
         position_mm=problem.predict(values)[0].tools[0, 3] * _MM,
-        nominal_crossed_mm=nominal_crossed * _MM,
-        rival_mm=rival * _MM,
-        failed_folds=0 if crossed is None else crossed.failed_folds,
+        nominal_crossed_mm=nominal_crossed[0] * _MM,
+        rival_mm=rival[0] * _MM,
         at_rest_mm=record_errors(problem, values) * _MM if fit.drifts else None,
-        cross_validated_at_rest_mm=judged_at_rest if fit.drifts else None,
+        cross_validated_at_rest_mm=judged[1] * _MM if fit.drifts else None,
         residual_columns=_columns(problem),
         unit=fit.unit,
         name=fit.name,
-        turns=turned,
+        turns=TurnErrors(*map(np.degrees, turned)) if measures_turns(problem) else None,
     )
 
 
-def _nominal(
-    fit: Fit, by_folds: bool
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array] | None, Sequence[Array]]:
-    """Errors (m, N each) and turns (rad; None where none are measured) of the nominal arm, and its residuals.
+def _of_both(problem: Problem, values: Array, training: Problem | None = None) -> Array:
+    """Errors of lengths (m) and of orientations (rad; nan where none are measured) (2 x N)."""
+    errors, turns = errors_and_turns(problem, values, training)
+    return np.array([errors, np.full(len(errors), np.nan) if turns is None else turns])
 
-    Each as shown, cross-validated, and as the rival of a calibration; see ``RecordErrors``.
+
+def _nominal(fit: Fit, by_folds: bool) -> tuple[Array, Array, Array, Sequence[Array]]:
+    """Errors of the nominal arm (2 x N each), as ``_of_both`` has them, and its residuals.
+
+    As shown, cross-validated, and as the rival of a calibration; see ``RecordErrors``.
     """
     problem, train, held = fit.problem, fit.split.train, fit.split.holdout
     names = _placing_names(fit.acting)
     shown, values = _placed(fit.acting, names, problem.parameters.nominal())
-    errors, turns = errors_and_turns(shown.with_records(problem.records), values)
-    rival, rival_turns = np.full((2, len(fit.dataset)), np.nan)
-    rival[held], rival_turns[held] = errors[held], np.nan if turns is None else turns[held]
+    errors = _of_both(shown.with_records(problem.records), values)
+    rival = np.full(errors.shape, np.nan)
+    rival[:, held] = errors[:, held]
     for split in fit.ready.folds if by_folds else ():
         fold, there = _placed(fit.acting.subset(split.train), names, values)
         judged = train[split.holdout]
-        off, turned = errors_and_turns(fold.with_records(problem.subset(judged).records), there)
-        rival[judged], rival_turns[judged] = off, np.nan if turned is None else turned
-    crossed: tuple[Array, Array | None] = rival, rival_turns
-    if not _found(fit, names, errors):
+        rival[:, judged] = _of_both(fold.with_records(problem.subset(judged).records), there)
+    crossed = rival
+    if not _found(fit, names, errors[0]):
         shown, values = untrained(problem), problem.parameters.nominal()
-        errors, turns = crossed = errors_and_turns(shown, values)
+        errors = crossed = _of_both(shown, values)
     residual = problem.residuals(settled(shown.with_records(problem.records), values))
     if {block.name for block in problem.parameters.free if not block.nuisance} == names:
-        rival, rival_turns = np.full((2, len(rival)), np.nan)
-    both = None if turns is None or crossed[1] is None else (turns, crossed[1], rival_turns)
-    return (errors, crossed[0], rival), both, residual
+        rival = np.full(rival.shape, np.nan)
+    return errors, crossed, rival, residual
 
 
 def _placing_names(problem: Problem) -> set[str]:

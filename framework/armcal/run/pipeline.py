@@ -286,7 +286,7 @@ def validated(context: RunContext, own: Fit) -> Fit:
 
 def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> RunResult:
     """What a run knows of its fit, with the verdict on it."""
-    experiment, failed = context.experiment, own.errors.failed_folds
+    experiment, failed = context.experiment, own.crossed.failed_folds if own.crossed else 0
     with context.watch.stage("judge"):
         context.progress("judging", 0.0)
         verdict = verdict_of(own, experiment.registry)
