@@ -367,25 +367,11 @@ def _since(far: Indices, near: Indices, position: Indices) -> int | None:
     return int(order[best]) if inside >= _RUN and outside <= 1 - _RUN else None
 
 
-@dataclass(frozen=True)
-class Moved:
-    """A group whose first records lie elsewhere than the others.
-
-    Attributes:
-        before, after: how many records there are of each.
-    """
-
-    measurement: str  # whose residuals show it
-    key: str  # of the group
-    before: int
-    after: int
-    distance: float  # of the two means (m)
-    scatter: float  # standard deviation of a residual's entry within the two parts (m)
-
-
-def moved_groups(problem: Problem, values: Array) -> tuple[Moved, ...]:
+def moved_groups(problem: Problem, values: Array) -> list[Finding]:
     """Groups among weighted records that seem to have moved once, by the clearest split."""
-    moved, plan = [], problem.blueprint
+    findings, plan = [], problem.blueprint
+    test = f"the best split in recorded order, limit {APART:g} standard deviations"
+    action = "Give the records before the move a label of their own, or leave them out."
     residuals = problem.residuals(values)
     for kernel, record, residual in zip(problem.kernels, problem.records, residuals, strict=True):
         if record.group is None:
@@ -394,32 +380,21 @@ def moved_groups(problem: Problem, values: Array) -> tuple[Moved, ...]:
         group, weighted = record.group[: record.count], record.weight[: record.count] > 0
         for number in np.unique(group[weighted & (group >= 0)]):
             own = residual[lengths][:, weighted & (group == number)]
-            if own.shape[1] >= FEWEST and lengths.any():
-                before, distance, scatter = _split(own)
-                if distance > APART * scatter:
-                    key = group_key(plan.measurements, plan.groups, kernel.factor.name, number)
-                    after = own.shape[1] - before
-                    moved.append(Moved(kernel.factor.name, key, before, after, distance, scatter))
-    return tuple(moved)
+            if own.shape[1] < FEWEST or not lengths.any():
+                continue
+            before, distance, scatter = _split(own)
+            if distance > APART * scatter:
+                key = group_key(plan.measurements, plan.groups, kernel.factor.name, number)
+                text = f"{key}: its first {before} records lie {digits(distance * _MM)} mm from the other "
+                text += (
+                    f"{own.shape[1] - before}, {distance / scatter:.0f} times their spread. Did it move, or the base?"
+                )
+                findings.append(Finding("warning", text, test, action))
+    return findings
 
 
 def moved(fit: Fit) -> list[Finding]:
-    if not fit.converged:
-        return []
-    return moved_findings(moved_groups(fit.acting, fit.estimate.values))
-
-
-def moved_findings(moved: Sequence[Moved]) -> list[Finding]:
-    return [
-        Finding(
-            "warning",
-            f"{group.key}: its first {group.before} records lie {digits(group.distance * _MM)} mm from the other "
-            f"{group.after}, {group.distance / group.scatter:.0f} times their spread. Did it move, or the base?",
-            f"the best split in recorded order, limit {APART:g} standard deviations",
-            "Give the records before the move a label of their own, or leave them out.",
-        )
-        for group in moved
-    ]
+    return moved_groups(fit.acting, fit.estimate.values) if fit.converged else []
 
 
 def _split(residual: Array) -> tuple[int, float, float]:

@@ -216,24 +216,21 @@ def scale(fit: Fit) -> list[Finding]:
     (problem, rows), estimate, own = fit.of(sampled_rows), fit.estimate, fit.of(figure)
     read = predicted_positions(problem, estimate.values, fit.dataset.subset(thinned(fit.split.train)))
     instrument_sd = scale_deviation(problem, rows, read, estimate.noise_scale, estimate.values)
-    by_distances = not any(map(len, read))  # no instrument has a scale, but known distances have
-    findings = []
-    if instrument_sd is not None and by_distances:
+    findings, test = [], "two standard deviations of a scale beside the parameters"
+    if instrument_sd is not None and not any(map(len, read)):  # no instrument has a scale, but known distances have
         text = (
             "The arm's size rests on the known distances alone: 1 % of them is 1 % of all its lengths "
             f"({digits(0.01 * own.reach_mm, 2)} mm at the arm's reach), and an error of them "
-            f"{_unseen(instrument_sd, own)}."
         )
         action = "Measure these distances again, by other means; or train on a longer one."
-        findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
+        findings.append(Finding("note", f"{text}{_unseen(instrument_sd, own)}.", test, action))
     elif instrument_sd is not None:
         text = (
             f"The answer is in the instrument's frame: in it the arm stands {digits(own.moved_mm)} mm and "
-            f"{digits(own.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's "
-            f"scale {_unseen(instrument_sd, own)}."
+            f"{digits(own.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's scale "
         )
         action = "Measure a known length with the instrument, if the scale matters."
-        findings.append(Finding("note", text, "two standard deviations of a scale beside the parameters", action))
+        findings.append(Finding("note", f"{text}{_unseen(instrument_sd, own)}.", test, action))
     for one, check in fit.of(held_scales):
         contradicts = one.p_value < OFF
         put = f"records and priors put it {100 * one.off:+.2g} +- {100 * one.sd:.2g} % from there"
@@ -265,10 +262,9 @@ def hidden_payload(fit: Fit) -> HiddenPayload | None:
         return None
     rows, at = FitRows.of(problem, estimate), LOADS.index("mass")
     mass = rows.columns([slope[:, at, :, None] for slope in motion.by_load])[:, 0]
-    sizes = np.linalg.norm(rows.slopes, axis=0)
-    shares = np.linalg.lstsq(rows.slopes / np.maximum(sizes, 1e-300), mass, rcond=1e-9)[0]
-    left = float(np.linalg.norm(mass - rows.slopes / np.maximum(sizes, 1e-300) @ shares))
-    whole = float(np.linalg.norm(mass))
+    slopes = rows.slopes / np.maximum(np.linalg.norm(rows.slopes, axis=0), 1e-300)
+    shares = np.linalg.lstsq(slopes, mass, rcond=1e-9)[0]
+    left, whole = float(np.linalg.norm(mass - slopes @ shares)), float(np.linalg.norm(mass))
     if not whole or left > _HIDDEN * whole:
         return None
     names = problem.parameters.coordinate_names
@@ -319,7 +315,6 @@ class PriorsAlone:
     worst_mm: float  # the largest standard deviation of the tip that they leave, over the poses looked at
     between_mm: float
     poses: int  # how many unseen poses of each kind were looked at
-    up_to: str = ""  # motions that were left out, because nothing that was measured sees them; empty where none were
 
 
 def unseen_poses(dataset: Dataset, channels: Sequence[str], between: bool = False) -> Dataset:
@@ -356,7 +351,7 @@ def priors_alone(fit: Fit) -> PriorsAlone | None:
     at, between = (tip_by_priors(fit, unseen_poses(fit.ready.trained, channels, own)) for own in (False, True))
     if at is None or between is None:
         return None
-    return PriorsAlone(at, max(at, between), UNSEEN_POSES, "" if _position_rows(fit.problem) else UP_TO_FRAMES)
+    return PriorsAlone(at, max(at, between), UNSEEN_POSES)
 
 
 def tip_by_priors(fit: Fit, poses: Dataset) -> float | None:
@@ -425,10 +420,14 @@ def _position_rows(problem: Problem) -> list[int]:
 
 def determined(fit: Fit) -> list[Finding]:
     judged, plain = fit.judged_mm[np.isfinite(fit.judged_mm)], fit.before or fit  # a pose residual determines nothing
-    return [determined_finding(plain.estimate, plain.of(priors_alone), np.median(judged) if len(judged) else None)]
+    alone, typical_mm = plain.of(priors_alone), np.median(judged) if len(judged) else None
+    up_to = "" if alone is None or _position_rows(fit.problem) else UP_TO_FRAMES
+    return [determined_finding(plain.estimate, alone, typical_mm, up_to)]
 
 
-def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None) -> Finding:
+def determined_finding(
+    estimate: Estimate, alone: PriorsAlone | None, typical_mm: float | None, up_to: str = ""
+) -> Finding:
     sources, combinations = estimate.sources, estimate.identifiability.undetermined
     test = "rank of the Jacobian in typical scales"
     if not sources:
@@ -443,7 +442,7 @@ def determined_finding(estimate: Estimate, alone: PriorsAlone | None, typical_mm
     if alone is None:
         return Finding("bad", f"{text}.", test, "Free fewer parameters, or measure what armcal identify asks for.")
     test = f"{test}; the tip at {alone.poses} poses of recorded joint positions, and at as many between them"
-    test += f"; positions, not orientations, up to {alone.up_to}, which nothing measured shows" if alone.up_to else ""
+    test += f"; positions, not orientations, up to {up_to}, which nothing measured shows" if up_to else ""
     negligible = np.inf if typical_mm is None else NEGLIGIBLE_SHARE * typical_mm
     if alone.between_mm <= negligible:
         most = f"{alone.between_mm:.2g}" if alone.between_mm >= 0.001 else "0.001"

@@ -119,18 +119,10 @@ def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
 
 
 def evidence(fit: Fit) -> dict[str, Any]:
-    alone = fit.of(priors_alone)
-    left, beyond, away = fit.of(structure), fit.of(large_errors), fit.of(elsewhere)
-    hidden, rounds = fit.of(hidden_payload), fit.of(rounding)
-    return {
-        "residual_structure": left and asdict(left),
-        "large_errors": beyond and asdict(beyond),
-        "priors_alone": alone and {"worst_mm": alone.worst_mm, "between_mm": alone.between_mm, "poses": alone.poses},
-        "elsewhere": away and asdict(away),
-        "hidden_payload": hidden and asdict(hidden),
-        "contradictions": [asdict(one) for one in fit.of(contradictions)],
-        "rounding": rounds and asdict(rounds),
-    }
+    analyses = (structure, large_errors, priors_alone, elsewhere, hidden_payload, rounding)
+    names = ("residual_structure", "large_errors", "priors_alone", "elsewhere", "hidden_payload", "rounding")
+    found = {name: own and asdict(own) for name, own in zip(names, map(fit.of, analyses), strict=True)}
+    return {**found, "contradictions": [asdict(one) for one in fit.of(contradictions)]}
 
 
 def _errors_text(fit: Fit, judged_mm: Array, judged_on: str) -> str:
