@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import betainc, chdtri
 
-from armcal.arm.assembly import shown_joint
+from armcal.arm.assembly import command_channels, shown_joint
 from armcal.base.arrays import Array, Indices
 from armcal.base.units import digits, display_unit, readable, to_unit
 from armcal.diagnose.checks import Finding, first_few
@@ -21,7 +21,6 @@ from armcal.estimate.robust import LEVEL, SMALLEST_SCALE, Distances, WeighedFit,
 from armcal.estimate.validation import error_dimension
 from armcal.estimate.variance import VarianceComponents
 from armcal.measure.groups import group_key
-from armcal.problem.motion import Motion
 from armcal.problem.problem import Problem
 from armcal.problem.records import noise_roots
 
@@ -109,50 +108,38 @@ def large_errors(fit: Fit) -> LargeErrors | None:
         return None
     missed = np.flatnonzero(known & (times > 1))
     missed = missed[np.argsort(-times[missed], kind="stable")]
-    explained: tuple[Miss, ...] = ()
-    if len(missed):
-        leverage = _above(np.sum(far.leverages, axis=0))
-        efforts = {name: _above(np.abs(loads.efforts)) for name, loads in fit.motion.loads.items()}
-        residuals = fit.few.residuals(fit.estimate.values)
-        farthest = missed[:MOST_EXPLAINED]
-        explained = tuple(_miss(fit, int(i), errors[i], times[i], residuals, leverage, efforts) for i in farthest)
+    leverage = _above(np.sum(far.leverages, axis=0))
+    efforts = {name: _above(np.abs(loads.efforts)) for name, loads in fit.motion.loads.items()}
+    residual = np.vstack(fit.few.residuals(fit.estimate.values))  # raw, in one sign convention
+    lengths = np.linalg.norm(residual, axis=0)
+
+    def explained(record: int) -> Miss:
+        beside = np.abs(fit.position - fit.position[record]) == 1
+        same = residual[:, record] @ residual > _ALIKE * lengths[record] * lengths
+        alike = bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
+        far_out, heavy = leverage[record] > UNUSUAL, _heaviest(record, fit, efforts)
+        reasons = [
+            "its prediction is among the 5 % that depend most on the parameters' uncertainty" if far_out else "",
+            heavy,
+            "its neighbours in the recording miss in the same direction" if alike else "",  # and not by little
+            _along(record, fit, residual[:, record]),
+        ]
+        advice = "measure it again: it may be a single wrong measurement"
+        if alike:
+            advice = "measure this pose again, at another time and coming from elsewhere"
+        elif far_out or heavy:
+            advice = "measure more poses like it"
+        unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
+        row, turned = fit.dataset.rows[record] if fit.dataset.rows else 0, None
+        if (turns := fit.errors.turns) is not None:
+            judged = turns.cross_validated_deg[record]
+            turned = float(judged if np.isfinite(judged) else turns.calibrated_deg[record])
+        whole = float(errors[record]), turned, float(times[record])
+        return Miss(fit.dataset.ids[record], row, *whole, unusual, advice)
+
     limit = float(np.median((errors / np.maximum(times, SMALLEST_SCALE))[known])) if stated is None else stated
-    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), explained)
-
-
-def _miss(
-    fit: Fit,
-    record: int,
-    error_mm: float,
-    times: float,
-    residuals: Sequence[Array],
-    leverage: Array,
-    efforts: Mapping[str, Array],
-) -> Miss:
-    """``residuals`` are raw, of each factor (n_r x N), in one sign convention."""
-    problem, dataset, motion = fit.problem, fit.dataset, fit.motion
-    whole, step = np.vstack(residuals), fit.position - fit.position[record]
-    lengths, beside = np.linalg.norm(whole, axis=0), np.abs(step) == 1
-    same = whole[:, record] @ whole > _ALIKE * lengths[record] * lengths
-    alike = bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
-    far = bool(leverage[record] > UNUSUAL)
-    heavy, along = _heaviest(record, problem, motion, efforts), _along(record, problem, motion, residuals)
-    reasons = [
-        "its prediction is among the 5 % that depend most on the parameters' uncertainty" if far else "",
-        heavy,
-        "its neighbours in the recording miss in the same direction" if alike else "",  # and not by little
-        along,
-    ]
-    advice = "measure it again: it may be a single wrong measurement"
-    if alike:
-        advice = "measure this pose again, at another time and coming from elsewhere"
-    elif far or heavy:
-        advice = "measure more poses like it"
-    unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
-    row, turns = dataset.rows[record] if dataset.rows else 0, fit.errors.turns
-    judged = None if turns is None else (turns.cross_validated_deg[record], turns.calibrated_deg[record])
-    turned = None if judged is None else float(judged[0] if np.isfinite(judged[0]) else judged[1])
-    return Miss(dataset.ids[record], row, float(error_mm), turned, float(times), unusual, advice)
+    misses = tuple(explained(int(i)) for i in missed[:MOST_EXPLAINED])
+    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), misses)
 
 
 def _above(numbers: Array) -> Array:
@@ -161,11 +148,11 @@ def _above(numbers: Array) -> Array:
     return np.asarray((ranks + 1) / numbers.shape[-1])
 
 
-def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[str, Array]) -> str:
-    arms = problem.blueprint.arms
+def _heaviest(record: int, fit: Fit, efforts: Mapping[str, Array]) -> str:
+    arms = fit.problem.blueprint.arms
     for name, arm in arms.items():
         joint = int(np.argmax(efforts[name][:, record]))
-        effort = float(motion.loads[name].efforts[joint, record])
+        effort = float(fit.motion.loads[name].efforts[joint, record])
         if efforts[name][joint, record] > UNUSUAL and abs(effort) > 1e-9:
             shown = shown_joint(f"{name}.{arm.joint_names[joint]}", arms)
             unit = "N m" if arm.joint_dimensions[joint] == "angle" else "N"
@@ -173,25 +160,21 @@ def _heaviest(record: int, problem: Problem, motion: Motion, efforts: Mapping[st
     return ""
 
 
-def _along(record: int, problem: Problem, motion: Motion, residuals: Sequence[Array]) -> str:
-    """The joint whose own motion the residual follows, and how far off it would be; only what chance rarely does."""
-    own = np.concatenate([r[:, record] for r in residuals])
-    slopes = np.concatenate([s[:, :, record] for s in motion.slopes])
+def _along(record: int, fit: Fit, own: Array) -> str:
+    """The joint whose own motion a residual follows, and how far off it would be; only what chance rarely does."""
+    slopes, arms = np.concatenate([s[:, :, record] for s in fit.motion.slopes]), fit.problem.blueprint.arms
     lengths = np.linalg.norm(slopes, axis=0) * np.linalg.norm(own)
     if len(own) < 2 or not np.any(lengths > 0):
         return ""
     cosine = np.abs(own @ slopes) / np.where(lengths > 0, lengths, np.inf)
     best = int(np.argmax(cosine))
     chance = float(betainc((len(own) - 1) / 2, 0.5, max(0.0, 1 - float(cosine[best]) ** 2)))
-    chance = 1 - (1 - chance) ** int(np.sum(lengths > 0))
-    if chance > _CHANCE:
+    if 1 - (1 - chance) ** int(np.sum(lengths > 0)) > _CHANCE:
         return ""
-    name, _, joint = motion.channels[best].partition(".")
-    arm = problem.blueprint.arms[name]
-    unit = display_unit(arm.commanded[joint])
-    off = abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best])))
-    shown = shown_joint(motion.channels[best], problem.blueprint.arms)
-    return f"its error lies along {shown}'s own motion, as if {digits(to_unit(off, unit.name), 2)} {unit.name} off"
+    channel = fit.motion.channels[best]
+    unit = display_unit(command_channels(arms)[channel]).name
+    off = digits(to_unit(abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best]))), unit), 2)
+    return f"its error lies along {shown_joint(channel, arms)}'s own motion, as if {off} {unit} off"
 
 
 MOST_LISTED = 10
