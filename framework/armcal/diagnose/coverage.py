@@ -189,11 +189,11 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] = ()) -> Covera
     judged = np.flatnonzero(scores.judged)
     if not len(judged):
         return None
-    each = [stretches[i] for i in judged] if len(stretches) else []
-    widened = {_RADIUS: [np.nan if s is None or s.radius is None else s.radius for s in each]}
-    known = bool(each) and all(each)
+    factors = [stretches[i] for i in judged] if len(stretches) else []
+    widened = {_RADIUS: [np.nan if s is None or s.radius is None else s.radius for s in factors]}
+    known = bool(factors) and all(factors)
     if known:
-        widened |= {level_name(p): [s.coordinates[level_name(p)] for s in each if s] for p in LEVELS}
+        widened |= {level_name(p): [s.coordinates[level_name(p)] for s in factors if s] for p in LEVELS}
 
     def held(by_stretches: bool) -> dict[str, Array]:
         """Whether each number lies within its interval (n x N each): one, zero, or nan where there is none."""

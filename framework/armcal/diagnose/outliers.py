@@ -138,8 +138,8 @@ def large_errors(fit: Fit) -> LargeErrors | None:
         return Miss(fit.dataset.ids[record], row, *whole, unusual, advice)
 
     limit = float(np.median((errors / np.maximum(times, SMALLEST_SCALE))[known])) if stated is None else stated
-    misses = tuple(explained(int(i)) for i in missed[:MOST_EXPLAINED])
-    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), misses)
+    farthest = tuple(explained(int(i)) for i in missed[:MOST_EXPLAINED])
+    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), farthest)
 
 
 def _above(numbers: Array) -> Array:

@@ -121,8 +121,8 @@ def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
 def evidence(fit: Fit) -> dict[str, Any]:
     analyses = (structure, large_errors, priors_alone, elsewhere, hidden_payload, rounding)
     names = ("residual_structure", "large_errors", "priors_alone", "elsewhere", "hidden_payload", "rounding")
-    found = {name: own and asdict(own) for name, own in zip(names, map(fit.of, analyses), strict=True)}
-    return {**found, "contradictions": [asdict(one) for one in fit.of(contradictions)]}
+    content = {name: own and asdict(own) for name, own in zip(names, map(fit.of, analyses), strict=True)}
+    return {**content, "contradictions": [asdict(one) for one in fit.of(contradictions)]}
 
 
 def _errors_text(fit: Fit, judged_mm: Array, judged_on: str) -> str:
