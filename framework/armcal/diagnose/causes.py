@@ -265,7 +265,7 @@ class Records:
         return recorded_order(self.dataset)
 
     @cached_property
-    def rank(self) -> Array:
+    def rank(self) -> Indices:
         """How many records were recorded before each (N)."""
         return np.argsort(np.argsort(self.order, kind="stable"), kind="stable")
 

@@ -41,7 +41,6 @@ from armcal.estimate.validation import FitTask, JudgedFit, Recording, fit_and_ju
 from armcal.estimate.variance import apply_components
 from armcal.problem.problem import Problem
 
-Residuals = Sequence[Array]  # Raw residuals, one (n_r x N) a factor
 FEWEST = 40  # Judged records for a stretch to be found
 LEVEL = 0.005
 _MM = 1000.0
@@ -122,9 +121,9 @@ def predictor(fitted: WeighedFit) -> Predictor:
     return Predictor(*known, drift)
 
 
-def missed(by: Predictor, held: Problem) -> dict[Recording, Residuals]:
+def missed(by: Predictor, held: Problem) -> dict[Recording, tuple[Array, ...]]:
     """Residuals of records that a fit did not see; nan where a measurement was not made."""
-    residuals: dict[Recording, Residuals] = {"same": by.residuals(held)}
+    residuals: dict[Recording, tuple[Array, ...]] = {"same": by.residuals(held)}
     if by.drift is not None:
         residuals["new"] = held.residuals(by.values)
     return {
@@ -136,7 +135,7 @@ def missed(by: Predictor, held: Problem) -> dict[Recording, Residuals]:
     }
 
 
-def scored(problem: Problem, residuals: Residuals, spreads: Sequence[Spread]) -> Scores:
+def scored(problem: Problem, residuals: Sequence[Array], spreads: Sequence[Spread]) -> Scores:
     errors = [residual / spread.deviations for residual, spread in zip(residuals, spreads, strict=True)]
     reaches = [
         np.linalg.norm(residual[: len(POSITION)], axis=0) / spread.of(POSITION).radius()
@@ -189,7 +188,7 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] = ()) -> Covera
     judged = np.flatnonzero(scores.judged)
     if not len(judged):
         return None
-    factors = [stretches[i] for i in judged] if len(stretches) else []
+    factors = [stretches[int(i)] for i in judged] if len(stretches) else []
     widened = {_RADIUS: [np.nan if s is None or s.radius is None else s.radius for s in factors]}
     known = bool(factors) and all(factors)
     if known:
