@@ -25,7 +25,7 @@ from numpy.polynomial import legendre
 from scipy.linalg import eigh
 from scipy.special import stdtr
 
-from armcal.arm.assembly import Arm, SiteLoads, command_channels, shown_joint
+from armcal.arm.assembly import Arm, command_channels, shown_joint
 from armcal.arm.effects import joint_rate
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
