@@ -18,7 +18,7 @@ from armcal.base.config_text import resolve_path
 from armcal.base.settings import Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
-from armcal.errors import ArmcalError
+from armcal.errors import ArmcalError, ConfigError, Location
 from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import override
 
@@ -251,8 +251,23 @@ class BoardFile(Settings):
 
 
 def read_board(path: Any) -> Board:
-    """The board of a file that ``armcal board`` wrote."""
-    return validate(BoardFile, load_config(path)).board
+    """The board of a file that ``armcal board`` wrote, or of a target file of Kalibr."""
+    source = load_config(path)
+    target = source.data
+    try:
+        if target.get("target_type") == "aprilgrid":
+            tag = float(target["tagSize"])
+            sizes = {"tag": tag, "spacing": tag * float(target["tagSpacing"])}
+            return Aprilgrid.si(
+                type="aprilgrid", columns=target["tagCols"], rows=target["tagRows"], border_bits=2, **sizes
+            )
+        if target.get("target_type") == "checkerboard" and target["rowSpacingMeters"] == target["colSpacingMeters"]:
+            counts = {"columns": target["targetCols"], "rows": target["targetRows"]}
+            return Chessboard.si(type="chessboard", square=target["rowSpacingMeters"], **counts)
+    except (KeyError, TypeError, ValueError) as fault:
+        text = f"found {', '.join(map(str, target))}, expected the keys of a target of Kalibr ({fault})."
+        raise ConfigError(text, where=Location(str(path)), hint="Give the target file whole.") from fault
+    return validate(BoardFile, source).board
 
 
 def require_distinct(boards: Sequence[Board]) -> None:

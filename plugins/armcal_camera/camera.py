@@ -21,7 +21,15 @@ from armcal.measure.measurement import Channel, Mistake
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
-from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, normalised, projected
+from armcal_camera.intrinsics import (
+    DISTORTION,
+    IntrinsicsOrFile,
+    Lens,
+    Pixels,
+    normalised,
+    other_size,
+    projected,
+)
 from armcal_camera.render import rendered_records
 from armcal_camera.start import (
     FEWEST_POINTS,
@@ -223,6 +231,9 @@ class CameraSettings(InstrumentSettings):
             raise ValueError(f"found board_poses and boards_of: the poses are those of {self.boards_of}")
         if self.mounting == "eye_to_hand" and self.board_frame is not None and self.frame != TOOL_FRAME:
             raise ValueError("found frame and board_frame of a camera beside the arm: both say what carries the boards")
+        stated = self.intrinsics.image if self.intrinsics else None
+        if stated and self.image and (text := other_size(stated, self.image)):
+            raise ValueError(text)
         names, given = DISTORTION[self.model], self.intrinsics.distortion if self.intrinsics else ()
         if given and len(given) != len(names) and (self.model, len(given)) != ("pinhole", 4):
             raise ValueError(f"found {len(given)} distortion coefficients, expected {len(names)}: {', '.join(names)}")

@@ -25,6 +25,7 @@ from pydantic import Field
 from armcal_camera.board import Board
 from armcal_camera.detection import detect
 from armcal_camera.images import MOST_BYTES, grey_image, is_image
+from armcal_camera.intrinsics import other_size
 from armcal_camera.pose_table import read_poses
 
 _FEWEST = 3
@@ -100,6 +101,10 @@ class ImagesReader:
         for number, (name, boards) in enumerate(cameras.items()):
             folder = _own(self._settings.folder, name, len(cameras))
             views = _taken_once(as_the_others(_views(folder, boards, partial(of_all, number))))
+            size = next((view.size for view in views.values() if view.size and not view.fault), None)
+            stated = getattr(request.measurements[name], "image", None)
+            if size and stated and (text := other_size(stated, (size[0] / 1000, size[1] / 1000))):
+                raise DataError(f"{text}.", where=Location(str(folder)), hint=f"Correct measurements.{name}.")
             chosen = _matched(dataset, views, str(folder), count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
             dataset = _with_corners(dataset, name, [views[image] for image in chosen], known)

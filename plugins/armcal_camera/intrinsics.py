@@ -28,8 +28,8 @@ _NO_ANGLE = 1e-24
 _MOST_BYTES = 1024**2
 _FISHEYE = {"equidistant", "fisheye"}
 _PINHOLE = {"plumb_bob", "radtan", "none"}
-_MATRIX = ("camera_matrix", "cameraMatrix", "K", "M1")
-_DISTORTION = ("distortion_coefficients", "distCoeffs", "distortion", "D", "D1", "distortion_coeffs")
+_MATRIX = ("camera_matrix", "cameraMatrix", "K", "k", "M1")  # k and d: as ros2 topic echo prints them
+_DISTORTION = ("distortion_coefficients", "distCoeffs", "distortion", "D", "d", "D1", "distortion_coeffs")
 _HINT = "Give a camera_info YAML of ROS, an OpenCV YAML with camera_matrix, or a camchain of Kalibr."
 
 
@@ -60,7 +60,8 @@ def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
     """
     text = input_bytes(Path(path), _MOST_BYTES, "a file of intrinsics").decode("utf-8", "replace")
     try:
-        content = yaml.load("\n".join(x for x in text.splitlines() if not x.startswith("%YAML")), _Loader)
+        lines = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
+        content = next(filter(None, yaml.load_all(lines, _Loader)), None)  # ros2 topic echo parts messages by ---
     except yaml.YAMLError as fault:
         refuse(path, f"it is not YAML ({fault}).", _HINT)
     content = content.get("cam0", content) if isinstance(content, Mapping) else {}
@@ -72,19 +73,34 @@ def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
     if len(numbers) != 4:
         refuse(path, "found no camera matrix in it.", _HINT)
     distortion = tuple(next((_numbers(content[key]) for key in _DISTORTION if key in content), []))
-    size = _numbers([content.get("image_width"), content.get("image_height")]) or _numbers(content.get("resolution"))
+    size = _numbers([content.get(f"image_{side}", content.get(side)) for side in ("width", "height")])
+    size = size or _numbers(content.get("resolution"))
     stated = str(content.get("distortion_model", "plumb_bob")).lower()
     if stated == "rational_polynomial" and not any(distortion[5:]):  # k4 to k6 are zero
         stated, distortion = "plumb_bob", distortion[:5]
     if stated not in _FISHEYE | _PINHOLE:
         known = ", ".join(sorted(_FISHEYE | _PINHOLE))
-        refuse(path, f"found the distortion model {stated!r}, expected one of {known}.", _HINT)
+        hint = "Leave intrinsics out, so that they are found from the images, or calibrate the lens with plumb_bob."
+        hint = hint if stated == "rational_polynomial" else _HINT
+        refuse(path, f"found the distortion model {stated!r}, expected one of {known}.", hint)
     return IntrinsicsSettings.si(
         **{key: x / 1000 for key, x in zip(("fx", "fy", "cx", "cy"), numbers, strict=True)},
         distortion=distortion,
         model="fisheye" if stated in _FISHEYE else "pinhole",
         image=tuple(x / 1000 for x in size) if len(size) == 2 and min(size) > 0 else None,
     )
+
+
+def other_size(stated: tuple[float, float], found: tuple[float, float]) -> str:
+    """What to say of intrinsics of other images than were taken (width and height, thousands of px); empty if none."""
+    if np.abs(np.subtract(stated, found)).max() < 0.0015:
+        return ""
+    (width, height), (wide, tall), ratio = np.rint(np.multiply(1000, stated)), np.rint(np.multiply(1000, found)), 0.0
+    if abs(wide / width - tall / height) < 0.01 * wide / width:
+        ratio = wide / width
+    mend = f"scale fx, fy, cx and cy by {ratio:g}, or give" if ratio else "give"
+    text = f"the intrinsics are of {width:.0f} x {height:.0f} images, these are {wide:.0f} x {tall:.0f}"
+    return f"{text}: {mend} those of this resolution"
 
 
 def _numbers(value: Any) -> list[float]:

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from armcal.errors import ConfigError, DataError
 from armcal.run.experiment import Experiment
+from armcal_camera.board import Aprilgrid, Chessboard, read_board
 from armcal_camera.intrinsics import read_intrinsics
 
 DEMO = Path(__file__).resolve().parents[3] / "configs" / "camera" / "demo.yaml"
@@ -22,6 +23,8 @@ ROS = {
 }
 EIGHT = {"rows": 1, "cols": 8, "data": [-0.1, 0.02, 0.001, -0.001, 0.0, 0.0, 0.0, 0.0]}
 RATIONAL = {**ROS, "distortion_model": "rational_polynomial", "distortion_coefficients": EIGHT}
+ECHOED = f"height: 800\nwidth: 1280\ndistortion_model: plumb_bob\nd:\n- 0.1\n- 0.0\nk: {MATRIX}\n"
+ECHO = f"{ECHOED}---\n{ECHOED}"  # as ros2 topic echo prints messages
 KALIBR = {
     "cam0": {
         "camera_model": "pinhole",
@@ -40,7 +43,8 @@ def written(folder: Path, content: object) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("content", "model", "count"), [(ROS, "pinhole", 5), (RATIONAL, "pinhole", 5), (KALIBR, "fisheye", 4)]
+    ("content", "model", "count"),
+    [(ROS, "pinhole", 5), (RATIONAL, "pinhole", 5), (KALIBR, "fisheye", 4), (ECHO, "pinhole", 2)],
 )
 def test_files_of_ros_and_kalibr(tmp_path: Path, content: object, model: str, count: int) -> None:
     read = read_intrinsics(written(tmp_path, content))
@@ -72,7 +76,34 @@ def test_a_file_that_opencv_wrote(tmp_path: Path) -> None:
 def test_other_files_are_refused(tmp_path: Path, content: object, expected: str) -> None:
     with pytest.raises(DataError, match=expected) as refused:
         read_intrinsics(written(tmp_path, content))
-    assert "camera_info" in refused.value.hint
+    assert ("camera_info" in refused.value.hint) != ("found from the images" in refused.value.hint)
+
+
+@pytest.mark.parametrize(
+    ("size", "mend"),
+    [([1280, 960], "scale fx, fy, cx and cy by 2, or give"), ([1280, 720], "these are 1280 x 720: give those of")],
+)
+def test_intrinsics_of_another_image_size_are_refused(tmp_path: Path, size: list[int], mend: str) -> None:
+    text = DEMO.parent.joinpath("arm.yaml").read_text() + "    intrinsics: intrinsics.yaml\n"
+    (tmp_path / "arm.yaml").write_text(text.replace("image_px: [1280, 960]", f"image_px: {size}"))
+    written(tmp_path, {**ROS, "image_width": 640, "image_height": 480})
+    with pytest.raises(ConfigError, match=f"the intrinsics are of 640 x 480 images.*{mend}"):
+        Experiment.load(tmp_path / "arm.yaml")
+
+
+def test_targets_of_kalibr_are_boards(tmp_path: Path) -> None:
+    path = tmp_path / "target.yaml"
+    path.write_text("target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.024\ntagSpacing: 0.3\n")
+    grid = read_board(path)
+    assert isinstance(grid, Aprilgrid) and (grid.columns, grid.rows, grid.border_bits) == (6, 5, 2)
+    assert (grid.tag, grid.spacing) == pytest.approx((0.024, 0.0072))
+    size = "rowSpacingMeters: 0.03\ncolSpacingMeters: 0.03\n"
+    path.write_text(f"target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n{size}")
+    assert read_board(path) == Chessboard.si(type="chessboard", columns=6, rows=7, square=0.03)
+    for wrong in ("target_type: aprilgrid\ntagCols: 6\n", "target_type: circlegrid\ntargetCols: 6\n"):
+        path.write_text(wrong)
+        with pytest.raises(ConfigError):
+            read_board(path)
 
 
 def test_a_configuration_names_the_file(tmp_path: Path) -> None:
