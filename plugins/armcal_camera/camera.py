@@ -83,11 +83,11 @@ def first_guess(camera: Camera, reading: Reading) -> Proposal:
             "are is not determined.",
             "Name a camera that moves against the same boards in boards_of, or state board_poses and hold them.",
         )
-    for own_poses in poses if is_open is None else ():
+    for of, own_poses in zip(camera.boards, poses, strict=True) if is_open is None else ():
         if len(own_poses):
-            hand, board_ = moved[list(own_poses)], np.array(list(own_poses.values()))
-            require_form(hand, board_)
-            require_one_board(hand, board_, [reading.ids[i] for i in own_poses])
+            hand, seen = moved[list(own_poses)], np.array(list(own_poses.values()))
+            require_form(hand, seen)
+            require_one_board(hand, seen, [reading.ids[i] for i in own_poses], of)
     if is_open is not None and not any(own_poses for own_poses, held in zip(poses, known, strict=True) if held):
         return Proposal(proposed, *is_open, tuple(name for name in _place("camera") if name in free))
     boards = [board for board in zip(names, poses, known, strict=True) if board[1]]

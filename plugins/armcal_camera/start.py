@@ -21,6 +21,7 @@ from armcal.errors import ProblemError
 from armcal.problem.rigid_alignment import hand_eye as rotations_of
 from scipy.spatial.transform import Rotation
 
+from armcal_camera.board import Board, Chessboard
 from armcal_camera.images import opencv
 
 FEWEST_POINTS = 4  # of a board in an image
@@ -234,7 +235,7 @@ def _posed(rotations: Array, places: Array) -> Array:
     return poses
 
 
-def require_one_board(moved: Array, seen: Array, ids: Sequence[str]) -> None:
+def require_one_board(moved: Array, seen: Array, ids: Sequence[str], board: Board) -> None:
     """Refuse poses of the hand (N x 4 x 4) and camera_T_board (N x 4 x 4) of which pairs contradict each other."""
     if len(moved) < _FEWEST_PAIRED:
         return
@@ -256,6 +257,7 @@ def require_one_board(moved: Array, seen: Array, ids: Sequence[str]) -> None:
         across = float(np.mean(~agree[np.ix_(*groups)]))
         within = max(float(np.mean(~agree[np.ix_(group, group)])) for group in groups)
         if across > max(_LEAST_ACROSS, _TIMES_WITHIN * within):
+            _require_one_way_up(moved, seen, groups, board)
             raise ProblemError(
                 f"{len(groups[0])} of {len(moved)} images show a board that stands elsewhere than in the others: "
                 "two boards, or one that was moved.",
@@ -266,6 +268,27 @@ def require_one_board(moved: Array, seen: Array, ids: Sequence[str]) -> None:
             "the hand does not turn between images as the board is seen to turn: typically "
             f"{np.degrees(np.median(off[apart])):.0f} deg off.",
             hint="Check the order and signs of the joints and their unit, and which image belongs to which pose.",
+        )
+
+
+def _require_one_way_up(moved: Array, seen: Array, groups: Sequence[Indices], board: Board) -> None:
+    """Refuse a chessboard that looks the same after half a turn, if that explains what groups of images disagree on."""
+    if not isinstance(board, Chessboard) or (board.columns + board.rows) % 2:
+        return
+    turned, half = seen.copy(), np.diag([-1.0, -1.0, 1.0, 1.0])
+    half[:3, 3] = board.points.min(axis=0) + board.points.max(axis=0)
+    turned[groups[0]] = seen[groups[0]] @ half
+    hand, both = _pairs(moved)[0], np.ix_(*groups)
+    before, after = (
+        np.median(abs(hand - _pairs(np.asarray(np.linalg.inv(own), dtype=float))[0])[both]) for own in (seen, turned)
+    )
+    if after < before / _CLEARLY:
+        size = f"{board.columns} x {board.rows} inner corners"
+        raise ProblemError(
+            f"{len(groups[0])} of {len(moved)} images show the chessboard the other way up than the others, and a "
+            f"chessboard of {size} looks the same after half a turn: which corner is the first one is not known.",
+            hint="Take a board with one count even and the other odd, as 9 x 6; or turn the hand by less than 90 deg "
+            "about the line of sight, and leave these images out.",
         )
 
 

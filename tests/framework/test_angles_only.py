@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from armcal.calibration.calibration import Calibration
 from armcal.plugins import discover
-from armcal.run import outputs
+from armcal.run import result as outputs
 from armcal.testing.contract import check_component
 from outside import armcal, installed, strict
 

@@ -95,31 +95,31 @@ def test_the_arm_is_found_from_the_trained_positions(run):
 def test_errors_of_each_position_are_distances_to_its_sockets(run, data):
     """Fitted sockets where they were trained on, means of the postures elsewhere and before."""
     found, nominal = co.by_name(run.estimate.parameters, run.estimate.values), co.named(LEFT, "left")
-    assert [each.name for each in run.groups] == ["back", "front", "shelf"]
+    assert list(run.groups) == ["back", "front", "shelf"]
     before, keys = balls(data, nominal)
     after, of_nominal, of_found = balls(data, found)[0], means(data, nominal), means(data, found)
-    for each in run.groups:
-        inside = np.char.startswith(keys, each.name + "/")
+    for name, each in run.groups.items():
+        inside = np.char.startswith(keys, name + "/")
         fitted = {k: np.array([found[f"balls.{k}.{a}"] for a in "xyz"]) for k in np.unique(keys[inside])}
-        sockets = of_found if each.name == "shelf" else fitted
+        sockets = of_found if name == "shelf" else fitted
         left = [np.linalg.norm(x - sockets[k]) for x, k in zip(after[inside], keys[inside], strict=True)]
         expected = [np.linalg.norm(x - of_nominal[k]) for x, k in zip(before[inside], keys[inside], strict=True)]
-        assert each.records == inside.sum()
-        assert each.trained == (0 if each.name == "shelf" else inside.sum())
-        assert each.error_mm == pytest.approx(MM * np.mean(left), rel=1e-6)
-        assert each.nominal_error_mm == pytest.approx(MM * np.mean(expected), rel=1e-6)
+        assert each["records"] == inside.sum()
+        assert each["trained"] == (0 if name == "shelf" else inside.sum())
+        assert each["error_mm"] == pytest.approx(MM * np.mean(left), rel=1e-6)
+        assert each["nominal_error_mm"] == pytest.approx(MM * np.mean(expected), rel=1e-6)
 
 
 def test_known_distances_are_judged_by_what_the_postures_say(run, data):
     """Not by what the fit made of the sockets, which a known distance pulls to itself."""
     found, nominal = co.by_name(run.estimate.parameters, run.estimate.values), co.named(LEFT, "left")
-    for each in run.groups:
-        if each.name == "shelf":
-            assert each.distance_error_mm is None
+    for name, each in run.groups.items():
+        if name == "shelf":
+            assert each["distance_error_mm"] is None
             continue
-        for told, values in ((each.nominal_distance_error_mm, nominal), (each.distance_error_mm, found)):
+        for told, values in ((each["nominal_distance_error_mm"], nominal), (each["distance_error_mm"], found)):
             of = means(data, values)
-            apart = np.linalg.norm(of[f"{each.name}/hole_1"] - of[f"{each.name}/hole_0"])
+            apart = np.linalg.norm(of[f"{name}/hole_1"] - of[f"{name}/hole_0"])
             assert told == pytest.approx(MM * abs(apart - DISTANCE), rel=1e-5, abs=1e-7)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from armcal.base.arrays import Array
 from armcal.errors import ProblemError
+from armcal_camera.board import Chessboard
 from armcal_camera.start import require_form, require_one_board
 from scipy.spatial.transform import Rotation
 
@@ -73,7 +74,22 @@ def test_poses_in_their_form_pass_however_poor_the_arm(seeds: range) -> None:
 def test_images_with_the_pose_of_another_are_named() -> None:
     a, b = hand_and_board()
     names = [f"{i + 1}.png" for i in range(COUNT)]
-    require_one_board(a, b, names)
+    require_one_board(a, b, names, chessboard(9, 6))
     a[[0, 8]] = a[[8, 0]]
     with pytest.raises(ProblemError, match=r"does not move to 1.png, 9.png as the board .* the other 14 images agree"):
-        require_one_board(a, b, names)
+        require_one_board(a, b, names, chessboard(9, 6))
+
+
+def chessboard(columns: int, rows: int) -> Chessboard:
+    return Chessboard.si(type="chessboard", columns=columns, rows=rows, square=0.025)
+
+
+@pytest.mark.parametrize(("columns", "words"), [(8, "8 x 6 inner corners looks the same"), (9, "stands elsewhere")])
+def test_images_that_show_a_symmetric_chessboard_the_other_way_up_are_named(columns: int, words: str) -> None:
+    a, b = hand_and_board()
+    turned = [1, 4, 6, 11, 12]
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half[:2, 3] = 0.025 * (columns - 1), 0.025 * 5
+    b[turned] = b[turned] @ half
+    with pytest.raises(ProblemError, match=f"5 of 16 images show .*{words}"):
+        require_one_board(a, b, [f"{i + 1}.png" for i in range(COUNT)], chessboard(columns, 6))
