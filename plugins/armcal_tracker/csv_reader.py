@@ -363,6 +363,7 @@ def reflections(values: Array) -> Array:
 
 TOLERANCE = 1e-3  # How far a quaternion's length may be from one, or an entry of R^T R from the identity's
 MOST_FAULTY = 0.05
+_SAMPLES = (".yaml", ".yml", ".samples")
 WORST = ((5.0, 3.0), (0.5, 10.0))
 """The declared meaning of the columns is refused if it fits the arm worse than this (deg), and so many times worse than
 another; the second where the body hardly turned, as where a probe must face its tracker."""
@@ -426,6 +427,9 @@ class PoseCsvReader:
             DataError: with file, line and column; or the orientations are not those of this arm.
         """
         s, instance = self._settings, self._instance(request)
+        if s.path.suffix in _SAMPLES:
+            hint = f"Write data: {{type: pose_pairs, path: {s.path.name}, mounting: eye_to_hand}}, or eye_in_hand."
+            self._refuse("it is no CSV file; samples of a program for hand-eye calibration are read as pairs.", hint)
         mapped = {f"{instance}.{name}": own for name, own in self._orientation.mapped().items()}
         columns = {**s.columns, **mapped}
         reader = CsvReader(CsvSettings(path=s.path, columns=columns, delimiter=s.delimiter, decimal=s.decimal))
