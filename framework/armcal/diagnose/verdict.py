@@ -1,6 +1,6 @@
 """The verdict: what a person should conclude, each sentence from a check; and the checks of an estimate itself."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -25,7 +25,7 @@ from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import POOR_CONDITION, bound_together, correlated_pairs
 from armcal.estimate.identifiability import deviations as deviations_of
 from armcal.estimate.prediction import NewRecording
-from armcal.estimate.validation import pose_size, summarise
+from armcal.estimate.validation import Halves, pose_size, summarise
 from armcal.measure.measurement import Placed
 from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
 from armcal.plugins import PluginRegistry
@@ -327,7 +327,7 @@ def places(fit: Fit) -> list[Finding]:
     return [Finding("note", text) for text in known_accuracies(problem, estimate, fit.of(by_halves))]
 
 
-def known_accuracies(problem: Problem, estimate: Estimate, apart: Mapping[str, Array]) -> list[str]:
+def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:
     texts = []
     for name, measurement in problem.blueprint.measurements.items():
         if not isinstance(measurement, Placed):
@@ -337,8 +337,8 @@ def known_accuracies(problem: Problem, estimate: Estimate, apart: Mapping[str, A
         if np.isnan(mm + deg):
             continue
         text = f"{name}: its place {where} is known to {mm:.2g} mm and {deg:.2g} deg (95 %)"
-        if name in apart and np.isfinite(apart[name]).any():
-            mm, deg = np.nanmean(apart[name], axis=0)
+        if parts is not None and np.isfinite(parts.apart[name]).any():
+            mm, deg = np.nanmean(parts.apart[name], axis=0)
             text += f", and differs by {mm:.2g} mm and {deg:.2g} deg between halves of the records"
         texts.append(f"{text}.")
     return texts

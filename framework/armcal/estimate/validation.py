@@ -292,26 +292,36 @@ def cross_validate(
     return CrossValidation(errors, at_rest, turns if measures_turns(problem) else None, failed, tuple(fits))
 
 
-def halves(problem: Problem, estimator: Estimator, start: Array) -> dict[str, Array]:
-    """How far each pose that is ``Placed`` differs between fits to halves of the records as these weigh.
+@dataclass(frozen=True)
+class Halves:
+    """What fits to either half of the records say, of several divisions; nan where one did not converge.
 
-    In mm and deg, of several divisions (K x 2; nan where a fit did not converge); empty where no such pose is free,
-    or the records are few.
+    Attributes:
+        apart: how far the pose of each measurement that is ``Placed`` differs between the two (mm, deg; K x 2).
     """
+
+    apart: Mapping[str, Array]
+    errors: Array  # of records by the fit to the other half, on average (K; thousandths, as errors are shown)
+
+
+def halves(problem: Problem, estimator: Estimator, start: Array) -> Halves | None:
+    """Fits to halves of records as these weigh; None where no such pose is free, or the records are few."""
     named = {n: f"{n}.{m.place[0]}" for n, m in problem.blueprint.measurements.items() if isinstance(m, Placed)}
     free, count = set(problem.parameters.coordinate_names), problem.count
-    placed = {name: pose for name, pose in named.items() if f"{pose}_x" in free and count >= _FEWEST_HALVED}
-    apart = {name: np.full((_HALVINGS, 2), np.nan) for name in placed}
-    for number in range(_HALVINGS if placed else 0):
+    placed = {name: pose for name, pose in named.items() if f"{pose}_x" in free}
+    if not placed or count < _FEWEST_HALVED:
+        return None
+    apart, errors = {name: np.full((_HALVINGS, 2), np.nan) for name in placed}, np.full(_HALVINGS, np.nan)
+    for number in range(_HALVINGS):
         crossed = cross_validate(problem, folds(count, 2, number), estimator, start)
         one, other = (fit.values for fit in crossed.fits)
         if one is None or other is None:
             continue
-        parameters = problem.parameters.with_nominal(one)
+        parameters, errors[number] = problem.parameters.with_nominal(one), 1000 * np.nanmean(crossed.errors)
         steps = dict(zip(parameters.coordinate_names, parameters.coordinates(parameters.local(other)), strict=True))
         for name, pose in placed.items():
             apart[name][number] = pose_size(steps, pose)
-    return apart
+    return Halves(apart, errors)
 
 
 def pose_size(coordinates: Mapping[str, float], pose: str) -> tuple[float, float]:

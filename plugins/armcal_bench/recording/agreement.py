@@ -439,5 +439,5 @@ def _advised(judged: Assessment, problem: Problem, fitted: Fitted, dataset: Data
     best = suggest(problem, dataset.subset(np.flatnonzero(fitted.used)), made, joints, 1)
     own = {f"{n}.{local}": sd for n in problem.blueprint.measurements for local, sd in own_deviations(made, n).items()}
     finite = {name: sd for name, sd in own.items() if np.isfinite(sd) and sd > 0}
-    accuracy = tuple(known_accuracies(problem, made, {}))
+    accuracy = tuple(known_accuracies(problem, made))
     return replace(judged, accuracy=accuracy, deviations=finite, next=best[0] if best else None)
