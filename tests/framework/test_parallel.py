@@ -307,5 +307,9 @@ def test_ctrl_c_as_the_pool_starts_is_an_interrupt_and_no_fault_of_the_library(m
             raise RuntimeError("cannot join thread before it is started") from None
 
     monkeypatch.setattr("joblib.Parallel.__call__", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        Executor(2).map(abs, [1, 2])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            Executor(2).map(abs, [1, 2])
+    finally:
+        signal.signal(signal.SIGINT, before)
