@@ -91,11 +91,11 @@ def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
     )
 
 
-def other_size(stated: tuple[float, float], found: tuple[float, float]) -> str:
+def other_size(stated: tuple[float, float], taken: tuple[float, float]) -> str:
     """What to say of intrinsics of other images than were taken (width and height, thousands of px); empty if none."""
-    if np.abs(np.subtract(stated, found)).max() < 0.0015:
+    if np.abs(np.subtract(stated, taken)).max() < 0.0015:
         return ""
-    (width, height), (wide, tall), ratio = np.rint(np.multiply(1000, stated)), np.rint(np.multiply(1000, found)), 0.0
+    (width, height), (wide, tall), ratio = np.rint(np.multiply(1000, stated)), np.rint(np.multiply(1000, taken)), 0.0
     if abs(wide / width - tall / height) < 0.01 * wide / width:
         ratio = wide / width
     mend = f"scale fx, fy, cx and cy by {ratio:g}, or give" if ratio else "give"
