@@ -220,11 +220,11 @@ def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
 
 def answered(joint: str, commanded: float, ask: Callable[[str], str]) -> Verdict:
     size = f"{math.degrees(commanded):+.0f} deg"
-    wish = ask(
+    answer = ask(
         f"{joint} was commanded to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
     )
     kinds = {"y": ("right", commanded), "r": ("reversed", -commanded), "o": ("another", math.nan), "n": ("still", 0.0)}
-    kind, turned = kinds.get(wish, ("unclear", math.nan))
+    kind, turned = kinds.get(answer, ("unclear", math.nan))
     return _verdict(kind, joint, commanded, turned, "another joint" if kind == "another" else "")
 
 

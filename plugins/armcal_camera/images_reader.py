@@ -102,7 +102,7 @@ class ImagesReader:
             folder = _own(self._settings.folder, name, len(cameras))
             views = _taken_once(as_the_others(_views(folder, boards, partial(of_all, number))))
             size = next((view.size for view in views.values() if view.size and not view.fault), None)
-            stated = getattr(request.measurements[name], "image", None)
+            stated = image_size_of_intrinsics(request.measurements[name])
             if size and stated and (text := other_size(stated, (size[0] / 1000, size[1] / 1000))):
                 raise DataError(f"{text}.", where=Location(str(folder)), hint=f"Correct measurements.{name}.")
             chosen = _matched(dataset, views, str(folder), count)
@@ -119,6 +119,12 @@ class ImagesReader:
 def boards_of(measurement: object) -> Sequence[Board]:
     """The boards whose points are the channels ``u_K`` and ``v_K`` of a measurement; none if it is no camera."""
     return getattr(measurement, "boards", ())
+
+
+def image_size_of_intrinsics(measurement: object) -> tuple[float, float] | None:
+    """Width and height (thousands of px) of the images that a camera's stated intrinsics are of, if it has any."""
+    intrinsics = getattr(getattr(measurement, "settings", None), "intrinsics", None)
+    return intrinsics.image if intrinsics else None
 
 
 def _own(places: Path | Mapping[str, Path], camera: str, cameras: int) -> Path:

@@ -53,13 +53,13 @@ class Servo:
         return min(ends[0], rounded[0]) - _ANGLE_SLACK, max(ends[1], rounded[1]) + _ANGLE_SLACK
 
     @cached_property
-    def borne(self) -> tuple[int, int]:
+    def allowed_counts(self) -> tuple[int, int]:
         low, high = (pulse / self.clock.tick for pulse in self.pulse_range)
         return math.ceil(low - _COUNT_SLACK), math.floor(high + _COUNT_SLACK)
 
     def counts(self, angle: float) -> int:
-        """Nearest to an angle (rad), of those that it bears."""
-        fewest, most = self.borne
+        """Nearest to an angle (rad), within its pulse range."""
+        fewest, most = self.allowed_counts
         return min(max(int(self.clock.counts(self.table.pulse(angle))), fewest), most)
 
     def angle(self, counts: int) -> float:
@@ -213,14 +213,14 @@ class Pca9685Device(JointDevice, PulseDevice):
     def set_pulse(self, joint: str, pulse: float) -> float:
         servo = self._known(joint)
         counts = int(servo.clock.counts(pulse)) if math.isfinite(pulse) else 0
-        fewest, most = servo.borne
+        fewest, most = servo.allowed_counts
         if not max(fewest, 1) <= counts <= min(most, COUNTS - 1):
             low, high = (1e6 * end for end in servo.pulse_range)
             raise DeviceRefusedError(
-                f"found a pulse of {1e6 * pulse:g} us for {joint}, expected {low:g} to {high:g} us, which its servo "
-                "bears.",
+                f"found a pulse of {1e6 * pulse:g} us for {joint}, expected {low:g} to {high:g} us, the pulse "
+                "range of its servo.",
                 where=Location(str(self._settings.servos), field=f"servos.{joint}.pulse_range"),
-                hint="Ask for a pulse that it bears, or state its range if its data sheet gives a wider one.",
+                hint="Ask for a pulse in it, or state its range if its data sheet gives a wider one.",
             )
         self._begin(joint, counts)
         return counts * servo.clock.tick

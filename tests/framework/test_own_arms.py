@@ -106,7 +106,7 @@ class TestPulsesThatNoServoBears:
             assert clock.ask({"state": True})["offences"] == {}
         said = " ".join(done.output.split())
         assert "turn: its table reaches from -128.7 to 128.7 deg, not from -135.0 to 135.0 deg" in said
-        assert "the servo bears 480 to 2520 us" in said
+        assert "the servo's pulse_range is 480 to 2520 us" in said
         servo = yaml.safe_load(arm.servos.read_text())["servos"]["turn"]
         assert servo["pulses_us"][0] == 480 and servo["pulses_us"][-1] == 2520
         assert np.polyfit(servo["angles_deg"], servo["pulses_us"], 1)[0] == pytest.approx(1070 / 135, rel=0.01)

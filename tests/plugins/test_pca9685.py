@@ -125,7 +125,7 @@ def test_the_nearest_count_is_never_one_that_the_servo_does_not_bear(tmp_path, o
         for channel, joint in enumerate(JOINTS):
             device.energise(joint, float(angle))
             assert ends[joint][0] - 1e-12 <= link.chips[0].pulse_s(channel) <= ends[joint][1] + 1e-12
-            with pytest.raises(DeviceRefusedError, match=f"pulse of .* for {joint}, expected .* which its servo bears"):
+            with pytest.raises(DeviceRefusedError, match=f"pulse of .* for {joint}, .* the pulse range of its servo"):
                 device.set_pulse(joint, ends[joint][1] + 5e-6)
 
 

@@ -75,7 +75,7 @@ class BoardSettings(Settings):
 class ServoSettings(Settings):
     """A servo: its board, its channel (0 to 15), and its pulse lengths at known angles.
 
-    ``pulse_range`` is the shortest and the longest pulse that it bears, by its data sheet. No other is written to the
+    ``pulse_range`` is the shortest and the longest pulse that its data sheet allows. No other is written to the
     file or sent to the board.
     """
 
@@ -167,7 +167,7 @@ class ServoFile:
                 text = f"found channel {servo.channel}, which {first!r} has, expected its own"
                 raise ServoFileError(text, ("servos", joint, "channel"))
             try:
-                _check_borne(servo, self.boards[servo.board].clock)
+                _check_pulses(servo, self.boards[servo.board].clock)
                 check_longest(servo.table, self.boards[servo.board].clock)
             except ValueError as fault:
                 raise ServoFileError(str(fault), ("servos", joint, "pulses")) from fault
@@ -218,8 +218,8 @@ def board_fields(board: BoardSettings) -> list[tuple[str, str]]:
 def servo_fields(servo: ServoSettings) -> list[tuple[str, str]]:
     angles = _in_unit("angles", servo.angles, "deg", "rad")
     pulses = _in_unit("pulses", servo.pulses, "us", "s")
-    borne = _in_unit("pulse_range", servo.pulse_range, "us", "s")
-    stated = [borne] if "pulse_range" in servo.model_fields_set else []
+    allowed = _in_unit("pulse_range", servo.pulse_range, "us", "s")
+    stated = [allowed] if "pulse_range" in servo.model_fields_set else []
     return [("board", word(servo.board)), ("channel", str(servo.channel)), angles, pulses, *stated]
 
 
@@ -233,7 +233,7 @@ def digest(servos: Mapping[str, CalibratedServo]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-def _check_borne(servo: ServoSettings, clock: PulseClock) -> None:
+def _check_pulses(servo: ServoSettings, clock: PulseClock) -> None:
     low, high = servo.pulse_range
     if high - low < 2 * clock.tick:
         raise ValueError(
@@ -243,8 +243,8 @@ def _check_borne(servo: ServoSettings, clock: PulseClock) -> None:
     outside = [pulse for pulse in servo.pulses if not low <= pulse <= high]
     if outside:
         raise ValueError(
-            f"found a pulse of {1e6 * outside[0]:.1f} us, expected {1e6 * low:g} to {1e6 * high:g} us, which the servo "
-            "bears (pulse_range)"
+            f"found a pulse of {1e6 * outside[0]:.1f} us, expected {1e6 * low:g} to {1e6 * high:g} us, the "
+            "pulse_range of the servo"
         )
 
 

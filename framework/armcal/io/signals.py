@@ -1,4 +1,4 @@
-"""Signals become wishes that the loop looks at between records."""
+"""Signals become requests that a loop looks at between records."""
 
 import signal
 import threading

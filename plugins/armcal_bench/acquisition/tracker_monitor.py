@@ -179,7 +179,7 @@ class Waits:
         self._since[kind] = since, now
 
     def over(self, kind: str, now: float | None = None) -> None:
-        """It is waited for no longer: it came at ``now`` (s), or whoever gives it up reports that."""
+        """End the wait: what was awaited came at ``now`` (s), or never did, which the caller reports."""
         since, _ = self._since.pop(kind, (None, None))
         if since is not None and now is not None:
             self.say(f"going on after {duration(now - since)}.")

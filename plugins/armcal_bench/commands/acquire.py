@@ -156,8 +156,8 @@ def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForec
         f"{duration(forecast.resting)} together."
     )
     servos = zip(prepared.device.joint_names, forecast.hottest, prepared.scheduler.model.budget, strict=True)
-    if hot := [f"{joint} {100 * heat:.0f} %" for joint, heat, budget in servos if np.isfinite(budget)]:
-        console.line(f"hottest, of what each servo bears: {', '.join(hot)}.")
+    if hot := [f"{joint} {100 * heat:.0f}" for joint, heat, budget in servos if np.isfinite(budget)]:
+        console.line(f"hottest, % of each servo's limit: {', '.join(hot)}.")
     for step in forecast.steps:
         if isinstance(step, LeaveOut):
             console.line(f"left out: {step.why}.")

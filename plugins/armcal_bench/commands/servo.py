@@ -61,7 +61,7 @@ def servo(
             may_energise=warned(console, may_energise),
             report=lambda joint, done, planned: show(f"measuring {joint}", done / max(planned, 1)),
             say=partial(say, err=console.json),
-            wishes=lambda: operator_input(0, SERVO_KEYS, QUIT),
+            operator=lambda: operator_input(0, SERVO_KEYS, QUIT),
             waits=waits(console),
         )
         if setup is None:

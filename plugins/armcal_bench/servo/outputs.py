@@ -115,7 +115,7 @@ def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
     """The servo file with the fitted numbers.
 
     Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
-    part is kept whose pulses its servo bears.
+    part is kept that is in its servo's pulse range.
     """
     stated = {"id": adapter}
     boards = {name: board if board.id else board.model_copy(update=stated) for name, board in file.boards.items()}
@@ -136,15 +136,15 @@ def _fitted_table(
         return None
     # Counts stay what they are: the file's board may have another oscillator than that of the record.
     same = outcome.clocks[servo.board].oscillator_hz / board.oscillator_hz
-    return _borne_part(
+    return _allowed_part(
         PulseTable(fitted_servo.angles, tuple(round(p * same, 9) for p in fitted_servo.pulses)), servo, board
     )
 
 
-def _borne_part(table: PulseTable, servo: ServoSettings, board: BoardSettings) -> PulseTable | None:
-    """The part of a table whose pulses (s) its servo bears and its board can make; None where nothing is left."""
-    borne, longest = servo.pulse_range, board.clock.longest_pulse
-    low, high = max(borne[0], min(table.pulses)), min(borne[1], longest, max(table.pulses))
+def _allowed_part(table: PulseTable, servo: ServoSettings, board: BoardSettings) -> PulseTable | None:
+    """The part of a table whose pulses (s) servo and board allow; None where nothing is left."""
+    allowed, longest = servo.pulse_range, board.clock.longest_pulse
+    low, high = max(allowed[0], min(table.pulses)), min(allowed[1], longest, max(table.pulses))
     if (low, high) == (min(table.pulses), max(table.pulses)):
         return table
     if not low < high:
@@ -213,12 +213,12 @@ def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
         if not _is_written(fitted_servo, outcome, changed):
             if is_usable(fitted_servo):
                 sentences.append(
-                    f"{joint}: the table is left as it was: the servo bears none of the pulses that were found."
+                    f"{joint}: the table is left as it was: no pulse that was found is in the servo's pulse_range."
                 )
         elif servo.angles[0] > meant[0] + _APART or servo.angles[-1] < meant[1] - _APART:
             low, high = (1e6 * pulse for pulse in servo.pulse_range)
             shortened = (fitted_servo.angles[0], fitted_servo.angles[-1]) != (servo.angles[0], servo.angles[-1])
-            why = f"the servo bears {low:g} to {high:g} us" if shortened else "bench.servo.knots ends there"
+            why = f"the servo's pulse_range is {low:g} to {high:g} us" if shortened else "bench.servo.knots ends there"
             sentences.append(
                 f"{joint}: its table reaches from {math.degrees(servo.angles[0]):.1f} to "
                 f"{math.degrees(servo.angles[-1]):.1f} deg, not from {math.degrees(meant[0]):.1f} to "

@@ -61,7 +61,7 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
             targets = targets_of(setup)
             if done_in(record).issuperset(target.key for target in targets):
                 return
-            with _directed(setup, clock, talk, tables, record) as arm, talk.wishes() as operator:
+            with _directed(setup, clock, talk, tables, record) as arm, talk.operator() as operator:
                 Guided(setup, arm, operator, record, talk.say).run(targets)
         else:
             _tracked(setup, clock, talk, tables, record)
@@ -356,7 +356,7 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
             seen_turns = turned_a_little(prepared, turns, talk, clock)
             identity, verdicts = seen_turns.identity, seen_turns.judged(setup.base, setup.nominal)
         else:
-            with _directed(setup, clock, talk, tables) as arm, talk.wishes() as operator:
+            with _directed(setup, clock, talk, tables) as arm, talk.operator() as operator:
                 verdicts = [_by_eye(setup, arm, joint, turn, talk, operator) for joint, turn in turns.items()]
             identity = arm.identity
         noted(record, verdicts, {"adapter": identity.adapter, "by": seen, "at": clock.wall()})

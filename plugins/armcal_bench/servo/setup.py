@@ -115,7 +115,7 @@ class Conversation:
     may_energise: Callable[[FirstMotion], bool]
     report: ReportProgress  # takes how far a tracked calibration is
     say: Callable[[str], None]  # takes a line, of a guided one
-    wishes: Callable[[], AbstractContextManager[OperatorInput]]  # what somebody types, while it is asked for
+    operator: Callable[[], AbstractContextManager[OperatorInput]]  # what somebody types, while it is asked for
     waits: Waits = field(default_factory=Waits)  # says what is waited for
 
     def options(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> RunOptions:
@@ -226,7 +226,7 @@ class Setup:
         return (ends[0], *inner, ends[1])
 
     def pulses_of(self, joint: str) -> tuple[float, float]:
-        """The shortest and the longest pulse (s) that may be set: what the servo bears, and what is configured."""
+        """The shortest and the longest pulse (s) that may be set: the servo's range, and what is configured."""
         borne, allowed = self.file.servos[joint].pulse_range, self.settings.pulses
         return max(borne[0], allowed[0]), min(borne[1], allowed[1])
 
@@ -251,7 +251,7 @@ class Setup:
                     f"us, expected {1e6 * shortest:.0f} to {1e6 * longest:.0f} us.",
                     where=where,
                     hint="Choose another base pose; correct the servo's table, whose angles may lie a turn away; or "
-                    "widen bench.servo.pulses or its pulse_range if the servo bears it.",
+                    "widen bench.servo.pulses or its pulse_range if the servo's data sheet allows it.",
                 )
             low, high = limits[joint]
             if not low <= angle <= high:
@@ -423,7 +423,7 @@ class PulsedJoints(JointDevice):
             raise DeviceRefusedError(
                 f"{joint}: found a pulse of {1e6 * self.pulse(joint, counts):.0f} us, expected {1e6 * low:.0f} to "
                 f"{1e6 * high:.0f} us.",
-                hint="Narrow bench.servo.ranges; or widen bench.servo.pulses or its pulse_range if the servo bears it.",
+                hint="Narrow bench.servo.ranges; or widen bench.servo.pulses, or its pulse_range by the data sheet.",
             )
         return counts
 

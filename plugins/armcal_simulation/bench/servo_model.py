@@ -167,7 +167,7 @@ class JointServo:
 
 
 class ServoHeat:
-    """One servo's temperatures above the air, in parts of what the winding bears.
+    """One servo's temperatures above the air, as fractions of the winding's limit.
 
     Attributes:
         winding, case: of the two nodes.

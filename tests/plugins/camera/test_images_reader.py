@@ -20,6 +20,7 @@ pytest.importorskip("cv2")
 import cv2
 from armcal_camera.board import Board, Chessboard
 from armcal_camera.images_reader import ImagesReader, ImagesSettings
+from armcal_camera.intrinsics import IntrinsicsSettings
 from armcal_camera.pose_table import FLANGE
 from armcal_camera.render import Exposure, Lens, render
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
@@ -84,6 +85,15 @@ def request_of(joints: tuple[str, ...] = ("q1", "q2"), camera: Camera | None = N
 def read(request: ReadRequest | None = None, **settings: object) -> Any:
     given = {name: str(value) if isinstance(value, Path) else value for name, value in settings.items()}
     return ImagesReader(ImagesSettings.model_validate(given)).read(request or request_of())
+
+
+def test_intrinsics_of_half_the_images_size_are_refused_with_the_factor(folder: Path) -> None:
+    camera = Camera()
+    width, height = SIZE
+    half = {"fx": 0.4, "fy": 0.4, "cx": 0.3, "cy": 0.2, "image": (width / 2000, height / 2000)}
+    camera.settings = SimpleNamespace(intrinsics=IntrinsicsSettings.si(**half))
+    with pytest.raises(DataError, match=f"these are {width} x {height}: scale fx, fy, cx and cy by 2, or give"):
+        read(request_of(camera=camera), folder=folder, poses=folder / "poses.csv")
 
 
 @pytest.mark.slow
