@@ -134,7 +134,7 @@ def _different(kind: str, fitting: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _independent(joint: UrdfJoint, path: tuple[UrdfJoint, ...], names: Mapping[str, str]) -> Mimic | None:
-    """The joint that this one follows in the end, through others that follow too."""
+    """The joint of the chain that this one follows in the end, through others that follow too; None where it is off."""
     if joint.mimic is None:
         return None
     moving = {urdf_joint.name: urdf_joint for urdf_joint in path if urdf_joint.kind in MOVING}
@@ -142,10 +142,7 @@ def _independent(joint: UrdfJoint, path: tuple[UrdfJoint, ...], names: Mapping[s
     while True:
         master = moving.get(mimic.master)
         if master is None:
-            joint.element.refuse(
-                f"joint {joint.name!r} follows {mimic.master!r}, which is no moving joint of the chain.",
-                f"The chain has {', '.join(moving)}; choose root and tip so that it has both, or neither.",
-            )
+            return None
         if master.name in passed:
             joint.element.refuse(
                 f"joints follow one another in a circle: {', '.join([*passed, master.name])}.", "Free one of them."
@@ -270,7 +267,15 @@ class UrdfSettings(Settings):
         ignored = [f"ignored: {', '.join(robot.ignored)}"] if robot.ignored else []
         joints = chain_of(robot, self.root, self.tip).moving
         renamed = [f"{joint.urdf.name} is {joint.name}" for joint in joints if joint.name != joint.urdf.name]
-        return (*ignored, *([f"joints are named so that columns can be: {', '.join(renamed)}"] if renamed else []))
+        if renamed:
+            ignored.append(f"joints are named so that columns can be: {', '.join(renamed)}")
+        for joint in joints:
+            if joint.urdf.mimic and not joint.mimic:
+                ignored.append(
+                    f"{joint.urdf.name} follows {joint.urdf.mimic.master}, which is no moving joint of the chain from "
+                    f"{self.root} to {self.tip}: {joint.name} needs angles of its own"
+                )
+        return tuple(ignored)
 
     def to_config(self) -> dict[str, Any]:
         return {name: value for name, value in super().to_config().items() if name != "path"}

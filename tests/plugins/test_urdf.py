@@ -291,6 +291,15 @@ def test_a_joint_that_follows_a_follower_follows_the_first():
     assert joint.mimic.offset == pytest.approx(0.6)
 
 
+@pytest.mark.parametrize("master", ["focus", "stand", "nowhere"])
+def test_a_joint_whose_master_is_not_on_the_chain_is_a_joint_of_its_own_and_that_is_said(master):
+    arm = arm_of(ODD.replace('mimic joint="bend"', f'mimic joint="{master}"'))
+    assert list(dict(arm.commanded)) == ["turn", "bend", "slide", "level"]
+    (note,) = arm.model.settings.notes
+    off = f"level follows {master}, which is no moving joint of the chain from world to tool"
+    assert note == f"{off}: level needs angles of its own"
+
+
 def test_records_beyond_limits_are_warned_of_by_joint_count_and_worst():
     channels = {"arm.turn": [0, 50.0, 0], "arm.bend": [0.0, 2.5, 2.0005], "arm.slide": [-0.3, 0.3, 0]}
     data = Dataset(("1", "2", "3"), {name: np.array(x, dtype=float) for name, x in channels.items()})

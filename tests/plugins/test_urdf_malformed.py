@@ -179,10 +179,11 @@ def expected(pin, arm, data, commands):
         return None
     cache, found = model.createData(), []
     chain, settings = arm.model.urdf_chain, arm.model.settings
+    numbers = {re.sub(r"\s", " ", name): i for i, name in enumerate(model.names)}  # as XML has attributes read
     for q in commands:
         configuration = pin.neutral(model)
         for each, value in zip(chain.moving, arm.joint_commands(list(q)), strict=True):
-            joint = model.joints[model.getJointId(each.urdf.name)]
+            joint = model.joints[numbers[each.urdf.name]]
             told = [np.cos(value), np.sin(value)] if joint.nq == 2 else [value]
             configuration[joint.idx_q : joint.idx_q + joint.nq] = told
         pin.framesForwardKinematics(model, cache, configuration)
@@ -267,8 +268,6 @@ REFUSED = {
     ),
     "a circle": ('parent link="base"', 'parent link="tool"', "joints go round in a circle", 10),
     "self": ('mimic joint="j1"', 'mimic joint="j3"', "joint 'j3' follows itself", 29),
-    "an unknown master": ('mimic joint="j1"', 'mimic joint="j9"', "follows 'j9', which is no moving joint of", 23),
-    "a fixed master": ('mimic joint="j1"', 'mimic joint="j4"', "follows 'j4', which is no moving joint of", 23),
     "a floating joint": ('"j2" type="continuous"', '"j2" type="floating"', "joint 'j2' is floating, and stands", 17),
     "a planar joint": ('"j2" type="continuous"', '"j2" type="planar"', "joint 'j2' is planar, and stands", 17),
     "an unknown type": ('type="continuous"', 'type="Continuous"', "joint 'j2' has the type 'Continuous'", 17),
