@@ -254,6 +254,8 @@ def read_board(path: Any) -> Board:
     """The board of a file that ``armcal board`` wrote, or of a target file of Kalibr."""
     source = load_config(path)
     target = source.data
+    if not isinstance(target, dict) or "board" in target or not {"target_type", "tagCols", "targetCols"} & set(target):
+        return validate(BoardFile, source).board
     try:
         if target.get("target_type") == "aprilgrid":
             tag = float(target["tagSize"])
@@ -267,7 +269,8 @@ def read_board(path: Any) -> Board:
     except (KeyError, TypeError, ValueError) as fault:
         text = f"found {', '.join(map(str, target))}, expected the keys of a target of Kalibr ({fault})."
         raise ConfigError(text, where=Location(str(path)), hint="Give the target file whole.") from fault
-    return validate(BoardFile, source).board
+    text = f"found the target_type {target.get('target_type')!r}, expected aprilgrid, or checkerboard of square fields."
+    raise ConfigError(text, where=Location(str(path)), hint="Describe another board as armcal board does.")
 
 
 def require_distinct(boards: Sequence[Board]) -> None:

@@ -5,7 +5,9 @@ pixels, as the core holds places in an image; pixel (0, 0) is the centre of the 
 are ROS ``camera_info``, OpenCV's and Kalibr's.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -23,6 +25,7 @@ Lens: TypeAlias = Literal["pinhole", "fisheye"]
 Pixels: TypeAlias = Annotated[float, UnitOf("image")]
 DISTORTION = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 """Names of the distortion coefficients of each model, in OpenCV's order."""
+_NUMBER = re.compile(r"[-+.0-9eE]+")
 _STEPS = 40
 _NO_ANGLE = 1e-24
 _MOST_BYTES = 1024**2
@@ -66,16 +69,31 @@ def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
         refuse(path, f"it is not YAML ({fault}).", _HINT)
     content = content.get("cam0", content) if isinstance(content, Mapping) else {}
     content = content if isinstance(content, Mapping) else {}
-    matrix = next((_numbers(content[key]) for key in _MATRIX if key in content), [])
+
+    def numbers_of(*keys: str) -> list[float]:
+        key = next((key for key in keys if key in content), "")
+        try:
+            return _numbers(content[key]) if key else []
+        except (KeyError, ValueError, OverflowError):
+            refuse(path, f"{key}: found {str(content[key])[:200]}, expected numbers alone.", "Correct it.")
+
+    matrix = numbers_of(*_MATRIX)
     numbers = [matrix[i] for i in (0, 4, 2, 5)] if len(matrix) == 9 else []
     if not numbers and content.get("camera_model", "pinhole") == "pinhole":  # as Kalibr writes them
-        numbers = _numbers(content.get("intrinsics"))
+        numbers = numbers_of("intrinsics")
     if len(numbers) != 4:
         refuse(path, "found no camera matrix in it.", _HINT)
-    distortion = tuple(next((_numbers(content[key]) for key in _DISTORTION if key in content), []))
-    size = _numbers([content.get(f"image_{side}", content.get(side)) for side in ("width", "height")])
-    size = size or _numbers(content.get("resolution"))
-    stated = str(content.get("distortion_model", "plumb_bob")).lower()
+    distortion = tuple(numbers_of(*_DISTORTION))
+    sides = [numbers_of(f"image_{side}", side) for side in ("width", "height")]
+    size = [x for side in sides for x in side] or numbers_of("resolution")
+    stated = str(content.get("distortion_model") or "plumb_bob").lower()
+    if stated != "none" and not {*_DISTORTION} & set(content):
+        hint = "Give the file whole; of a lens without distortion write distortion_coefficients: [0, 0, 0, 0]."
+        refuse(path, f"found a camera matrix, and none of {', '.join(_DISTORTION)}.", hint)
+    if min(numbers[:2]) <= 0:
+        refuse(
+            path, f"found the focal lengths {numbers[0]:g} and {numbers[1]:g}, expected more than 0.", "Correct them."
+        )
     if stated == "rational_polynomial" and not any(distortion[5:]):  # k4 to k6 are zero
         stated, distortion = "plumb_bob", distortion[:5]
     if stated not in _FISHEYE | _PINHOLE:
@@ -104,12 +122,19 @@ def other_size(stated: tuple[float, float], taken: tuple[float, float]) -> str:
 
 
 def _numbers(value: Any) -> list[float]:
-    """A list of numbers, or the ``data`` of a matrix, row by row; empty where it is neither."""
-    entries = value.get("data") if isinstance(value, Mapping) else value
-    if not isinstance(entries, Sequence) or isinstance(entries, str):
-        return []
-    flat = [x for row in entries for x in (row if isinstance(row, Sequence) else [row])]
-    return [float(x) for x in flat if isinstance(x, int | float)]
+    """The numbers of a list, or of the ``data`` of a matrix, row by row; YAML takes 1e-05 for a text.
+
+    Raises:
+        KeyError, ValueError, OverflowError: there is no ``data``, or an entry is no finite number.
+    """
+    entries = value["data"] if isinstance(value, Mapping) else value
+    flat = entries if isinstance(entries, list) else [entries]
+    if all(isinstance(row, list) for row in flat):
+        flat = [x for row in flat for x in row]
+    for entry in flat:
+        if isinstance(entry, bool) or not _NUMBER.fullmatch(str(entry)) or not math.isfinite(float(str(entry))):
+            raise ValueError
+    return [float(str(x)) for x in flat]
 
 
 IntrinsicsOrFile: TypeAlias = Annotated[IntrinsicsSettings, or_file(read_intrinsics)]

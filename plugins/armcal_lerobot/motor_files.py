@@ -169,7 +169,7 @@ def teeth_of(degrees: float) -> int:
 
 def remount(offset: int) -> str:
     """What to do about a homing offset (counts) that the servo cannot store."""
-    teeth = max(1, round(abs(offset) * 360 / COUNTS_A_TURN / TOOTH_DEG))
+    teeth = max(1, round(min(abs(offset), 10 * COUNTS_A_TURN) * 360 / COUNTS_A_TURN / TOOTH_DEG))
     return (
         "Switch the arm's power off and on, and calibrate again; or remount it by "
         f"{teeth_text(teeth)} towards the middle of the encoder, and then calibrate again."
