@@ -21,7 +21,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from scipy.special import erf
 
-from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard, dictionary
+from armcal_camera.board import FAMILIES, Aprilgrid, Board, Charuco, Chessboard, dictionary
 from armcal_camera.images import Grey, opencv
 
 _AT_ONCE = 8  # corners: their pixels stay in the processor's cache
@@ -308,11 +308,20 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
     if is_double:
         return replace(nothing, fault=f"the tag {is_double[0]} was found {is_double[1]} times")
     known, pixels = board.tag_corners[seen, :, :2], _enlarged(places, reduced, image).reshape(-1, 4, 2)
+    others = []
     if isinstance(board, Charuco) and board.rows % 2 == 0:
-        other = board.model_copy(update={"legacy": not board.legacy})
-        if _astray(other.tag_corners[seen, :, :2], pixels) < _astray(known, pixels):
-            text = f"its tags stand as on a board with legacy: {str(other.legacy).lower()}"
-            return replace(nothing, fault=f"{text} (OpenCV before 4.6 printed these otherwise)")
+        text = f"its tags stand as on a board with legacy: {str(not board.legacy).lower()}"
+        printed = board.model_copy(update={"legacy": not board.legacy})
+        others.append((printed, f"{text} (OpenCV before 4.6 printed these otherwise)"))
+    if isinstance(board, Charuco | Aprilgrid) and board.columns != board.rows:
+        text = f"its columns and rows are exchanged: write columns: {board.rows}, rows: {board.columns}"
+        others.append((board.model_copy(update={"columns": board.rows, "rows": board.columns}), text))
+    least = _astray(known, pixels)
+    for other, text in others:
+        if (count := _astray(other.tag_corners[seen, :, :2], pixels)) < least:
+            least, nothing = count, replace(nothing, fault=text)
+    if least < _astray(known, pixels):
+        return nothing
     pixels, off = _turned(known, pixels)
     if off > _ASTRAY:
         text = f"the tags stand elsewhere than on the {board.kind}"
