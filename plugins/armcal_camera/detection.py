@@ -308,7 +308,7 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
     if is_double:
         return replace(nothing, fault=f"the tag {is_double[0]} was found {is_double[1]} times")
     known, pixels = board.tag_corners[seen, :, :2], _enlarged(places, reduced, image).reshape(-1, 4, 2)
-    others = []
+    others: list[tuple[Charuco | Aprilgrid, str]] = []
     if isinstance(board, Charuco) and board.rows % 2 == 0:
         text = f"its tags stand as on a board with legacy: {str(not board.legacy).lower()}"
         printed = board.model_copy(update={"legacy": not board.legacy})

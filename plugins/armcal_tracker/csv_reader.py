@@ -520,7 +520,12 @@ def nominal_rotations(arm: Arm, dataset: Dataset) -> Rotation:
 
 
 def misfit(measured: Rotation, nominal: Rotation) -> float:
-    """How far measured turns between records are from the nominal ones (rad, the median of pairs of records).
+    """How far measured turns between records are from the nominal ones (rad, the median of pairs of records)."""
+    return turned_alike(measured, nominal)[1]
+
+
+def turned_alike(measured: Rotation, nominal: Rotation) -> tuple[Rotation | None, float]:
+    """tool_T_body's rotation, None of too few records, and how far turns between records are off with it (rad).
 
     Turns from record to record, seen from the body, are the nominal ones seen from the tool: both sets of rotation
     vectors differ by one rotation, which is found first. [Park1994] Angles alone would not do: they stay the same
@@ -529,7 +534,7 @@ def misfit(measured: Rotation, nominal: Rotation) -> float:
     index = np.arange(len(nominal))
     pairs = [(index[:-stride], index[stride:]) for stride in _STRIDES if stride < len(nominal)]
     if not pairs:
-        return 0.0
+        return None, 0.0
     first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
     step = max(1, len(first) // _MOST_PAIRS)
     first, second = first[::step], second[::step]
@@ -538,7 +543,8 @@ def misfit(measured: Rotation, nominal: Rotation) -> float:
     usable = np.linalg.norm(turned, axis=1) < _LARGEST_TURN_RAD
     turned, seen = turned[usable], seen[usable]
     if len(turned) < FEWEST:
-        return 0.0
+        return None, 0.0
     left, _, right = np.linalg.svd(turned.T @ seen)
     tool_T_body = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return float(np.median(np.linalg.norm(turned @ tool_T_body - seen, axis=1)))
+    off = float(np.median(np.linalg.norm(turned @ tool_T_body - seen, axis=1)))
+    return Rotation.from_matrix(tool_T_body), off
