@@ -250,6 +250,9 @@ class BoardFile(Settings):
     board: AnyBoard
 
 
+_NARROWEST = 0.05  # of a tag: narrower gaps are metres, where a ratio is asked for
+
+
 def read_board(path: Any) -> Board:
     """The board of a file that ``armcal board`` wrote, or of a target file of Kalibr."""
     source = load_config(path)
@@ -258,8 +261,12 @@ def read_board(path: Any) -> Board:
         return validate(BoardFile, source).board
     try:
         if target.get("target_type") == "aprilgrid":
-            tag = float(target["tagSize"])
-            sizes = {"tag": tag, "spacing": tag * float(target["tagSpacing"])}
+            tag, ratio = float(target["tagSize"]), float(target["tagSpacing"])
+            if 0 < ratio < _NARROWEST:
+                text = f"tagSpacing: found {ratio:g}, expected the gap between tags divided by their size."
+                hint = f"If the gap is {1000 * ratio:g} mm, write {ratio / tag:.3g}."
+                raise ConfigError(text, where=Location(str(path)), hint=hint)
+            sizes = {"tag": tag, "spacing": tag * ratio}
             return Aprilgrid.si(
                 type="aprilgrid", columns=target["tagCols"], rows=target["tagRows"], border_bits=2, **sizes
             )

@@ -100,6 +100,12 @@ def test_targets_of_kalibr_are_boards(tmp_path: Path) -> None:
     size = "rowSpacingMeters: 0.03\ncolSpacingMeters: 0.03\n"
     path.write_text(f"target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n{size}")
     assert read_board(path) == Chessboard.si(type="chessboard", columns=6, rows=7, square=0.03)
+    path.write_text("target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 5\ntagSize: 0.024\ntagSpacing: 0.0072\n")
+    with pytest.raises(
+        ConfigError, match=r"tagSpacing: found 0\.0072, expected the gap between tags divided by"
+    ) as refused:
+        read_board(path)
+    assert refused.value.hint == "If the gap is 7.2 mm, write 0.3."
     for wrong in ("target_type: aprilgrid\ntagCols: 6\n", "target_type: circlegrid\ntargetCols: 6\n"):
         path.write_text(wrong)
         with pytest.raises(ConfigError):
