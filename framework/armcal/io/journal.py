@@ -6,7 +6,6 @@ log, ``synchronous=FULL``); others read meanwhile, by this module or any SQLite.
 """
 
 import json
-import os
 import resource
 import sqlite3
 from collections.abc import Iterator, Mapping
@@ -22,9 +21,7 @@ from armcal.errors import ArmcalError, DataError, InputError, Location
 from armcal.io.plain_files import make_folder
 
 JOURNAL = "journal.sqlite"
-_EARLIER = "journal"  # the folder of segments that versions before had in its place
-_EARLIER_LINES = "observations.jsonl"  # and what those of armcal servo had
-JOURNAL_FILES = (JOURNAL, *(f"{JOURNAL}{end}" for end in ("-wal", "-shm", "-journal", ".lock")), _EARLIER)
+JOURNAL_FILES = (JOURNAL, *(f"{JOURNAL}{end}" for end in ("-wal", "-shm", "-journal", ".lock")))
 """All that a journal may have in its folder."""
 TOTAL_BYTES = 64 << 20
 _ID, _FORMAT = 0x61726D63, 2
@@ -34,10 +31,10 @@ _TABLES = f"""
 BEGIN;
 PRAGMA application_id = {_ID};
 PRAGMA user_version = {_FORMAT};
-CREATE TABLE header (content TEXT NOT NULL, process INTEGER NOT NULL);
+CREATE TABLE header (content TEXT NOT NULL);
 CREATE TABLE entry (sequence INTEGER PRIMARY KEY, kind TEXT NOT NULL, content TEXT NOT NULL);
 CREATE TABLE checkpoint (sequence INTEGER PRIMARY KEY, state TEXT NOT NULL);
-INSERT INTO header VALUES ('{{}}', 0);
+INSERT INTO header VALUES ('{{}}');
 COMMIT;
 """
 
@@ -195,28 +192,39 @@ class Journal(KeptJournal):
         InputError: another process writes it, or the folder cannot be written.
         DataError: it is damaged, of another program, or of another version.
         JournalFullError: there is no room to begin one.
-
-    Attributes:
-        is_new: whether it held nothing when it was opened.
     """
 
     def __init__(self, folder: str | Path, header: Mapping[str, Any], total_bytes: int = TOTAL_BYTES) -> None:
         self.folder, self._total, self._failure = Path(folder), total_bytes, ""
         self.path = self.folder / JOURNAL
-        has_journal(self.folder)
         self._lock = FileLock(f"{self.path}.lock", timeout=0)
         try:
             make_folder(self.folder)
             self._lock.acquire()
         except Timeout as fault:
-            raise self._in_use() from fault
+            raise InputError(
+                "another process writes this journal already.",
+                where=Location(str(self.path)),
+                hint="End that process (see fuser), or give another folder; a journal can be read meanwhile.",
+            ) from fault
         except OSError as fault:
             hint = "Give a writable folder on a disk that works."
             text = f"the journal cannot be written ({fault})."
             raise InputError(text, where=Location(str(self.folder)), hint=hint) from fault
         try:
             self._open("rwc")
-            self._begin(_text(header))
+            text = _text(header)
+            if not self._is_empty:
+                self.verify()
+            with self._writing():
+                self._database.execute("PRAGMA journal_mode = WAL").fetchone()
+                self._database.execute("PRAGMA synchronous = FULL")
+                if self._is_empty:
+                    self._database.executescript(_TABLES)
+                there = "SELECT (SELECT count(*) FROM entry) + (SELECT count(*) FROM checkpoint)"
+                self.is_new = not self._row(there)[0]  # whether it held nothing
+                if self.is_new:
+                    self._database.execute("UPDATE header SET content = ?", (text,))
         except BaseException:
             self._leave()
             raise
@@ -269,29 +277,6 @@ class Journal(KeptJournal):
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 
-    def _begin(self, header: str) -> None:
-        if not self._is_empty:
-            self.verify()
-        with self._writing():
-            self._database.execute("PRAGMA journal_mode = WAL").fetchone()
-            self._database.execute("PRAGMA synchronous = FULL")
-            if self._is_empty:
-                self._database.executescript(_TABLES)
-            self.is_new = not self._row("SELECT (SELECT count(*) FROM entry) + (SELECT count(*) FROM checkpoint)")[0]
-            self._database.execute("UPDATE header SET process = ?", (os.getpid(),))
-            if self.is_new:
-                self._database.execute("UPDATE header SET content = ?", (header,))
-
-    def _in_use(self) -> InputError:
-        number = "of a number not yet known"
-        with suppress(ArmcalError), KeptJournal(self.folder) as kept:
-            number = kept._row("SELECT process FROM header")[0]
-        return InputError(
-            f"process {number} writes this journal already.",
-            where=Location(str(self.path)),
-            hint="End that process, or give another folder; a journal can be read meanwhile.",
-        )
-
     def _used(self) -> int:
         return _PAGE * int(self._row("PRAGMA page_count")[0] - self._row("PRAGMA freelist_count")[0])
 
@@ -326,20 +311,10 @@ class Journal(KeptJournal):
 
 
 def has_journal(folder: Path) -> bool:
-    """Whether a folder holds a journal.
-
-    Raises:
-        InputError: it holds one that was written by an earlier version, which this one does not read.
-    """
-    with suppress(OSError):
-        if (folder / JOURNAL).is_file():
-            return True
-        earlier = *sorted((folder / _EARLIER).glob("journal-*.log")), *folder.glob(_EARLIER_LINES)
-        if earlier:
-            hint = "Go on with that version, or give a new --out (of a recalibration, begun from its calibration.yaml)."
-            text = f"it holds a journal of an earlier version of armcal ({earlier[0].relative_to(folder)})."
-            raise InputError(text, where=Location(str(folder)), hint=hint)
-    return False
+    try:
+        return (folder / JOURNAL).is_file()
+    except OSError:
+        return False
 
 
 def _text(content: Any) -> str:
