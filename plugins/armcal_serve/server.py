@@ -10,7 +10,7 @@ from typing import Any
 
 from armcal.base.config_text import as_line
 from armcal.errors import ArmcalError
-from armcal.io.json_server import Answers, JsonServer
+from armcal.io.json_server import JsonServer
 from armcal.io.signals import Signals
 
 from armcal_serve.answers import Answerer
@@ -22,13 +22,13 @@ _GRACE_S = 10.0  # How long answers may take after the end was asked for
 _SWITCH_S = 5e-5  # So long the loading thread works on when there is something to answer
 
 
-class Server(Answers):
+class Server:
     """Serves one calibration's file, which may be replaced at any time, at a socket or by standard input and output."""
 
     def __init__(self, loader: Loader, notify: Notify) -> None:
         self._notify = notify
         self._file = CalibrationFile(loader, notify)
-        self._server = JsonServer(self, MAX_LINE_BYTES)
+        self._server = JsonServer(self._answering, self._refusal, MAX_LINE_BYTES)
 
     def run(self, socket: Path | None) -> None:
         """Load the calibration, which may take the compiler's time, and serve the socket, or standard input and output,
@@ -62,10 +62,10 @@ class Server(Answers):
             sys.setswitchinterval(switched)
             self._server.close()
 
-    def begin(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
+    def _answering(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
         return self._served.begin(line, arrived, self.status)
 
-    def refusal(self, fault: ArmcalError) -> bytes:
+    def _refusal(self, fault: ArmcalError) -> bytes:
         return as_line(refusal(None, fault)).encode()
 
     def status(self) -> Mapping[str, Any]:

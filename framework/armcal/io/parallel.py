@@ -20,7 +20,6 @@ T = TypeVar("T")
 R = TypeVar("R")
 Report = Callable[[float], None]  # Takes which fraction of the work is done
 
-WORTH_WORKERS_S = 6.0  # Starting worker processes takes a second or two: not worth it for less work than this
 MOST_PROCESSES = 1024
 _SAFE_PATH = "PYTHONSAFEPATH"
 _OPTION = Location("--parallel")
@@ -39,7 +38,7 @@ class Executor:
     """
 
     processes: int | None = None
-    worth_s: float = WORTH_WORKERS_S
+    worth_s: float = 6.0  # starting worker processes takes a second or two: not worth it for less work than this
 
     def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
         """``work`` of each task, in order; the first exception of any ends it and is raised as it was.
@@ -52,18 +51,16 @@ class Executor:
         began = time.perf_counter()
         for number, task in enumerate(tasks):
             report(number / len(tasks))
-            if self._hands_over(number, len(tasks), time.perf_counter() - began, (work, task)):
+            hands_over = (self.processes or 1) > 1
+            if self.processes is None and number and (remaining := len(tasks) - number) > 1:
+                spent = time.perf_counter() - began
+                hands_over = spent / number * remaining > self.worth_s and _picklable((work, task))
+            if hands_over:
                 self._map_elsewhere(work, tasks, results, report)
                 break
             results.append(work(task))
         report(1.0)
         return results
-
-    def _hands_over(self, number: int, count: int, spent: float, what: object) -> bool:
-        if self.processes is not None:
-            return self.processes > 1
-        remaining = count - number
-        return bool(number and remaining > 1 and spent / number * remaining > self.worth_s and _picklable(what))
 
     def _map_elsewhere(self, work: Callable[[T], R], tasks: Sequence[T], results: list[R], report: Report) -> None:
         """Append the results of the tasks that have none, from worker processes."""

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from stat import S_ISDIR, S_ISLNK, S_ISREG
 from typing import BinaryIO, NoReturn
@@ -16,16 +16,9 @@ _UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 def input_file(
     path: Path, most: int, expected: str, refusal: type[InputError] = DataError, buffering: int = -1
 ) -> BinaryIO:
-    """The file, opened to be read; its size was checked.
+    """The file, opened to be read; ``most`` is how many bytes it may have, ``expected`` what it should be.
 
     A pipe is opened without waiting for its writer, and refused like a device: neither says how much it holds.
-
-    Args:
-        path: of the file; links are followed.
-        most: bytes that it may have.
-        expected: what it should be, with its article.
-        refusal: what is raised.
-        buffering: as of ``open``.
 
     Raises:
         InputError: of the kind ``refusal``: there is none, it is a directory, a device or a pipe, it is too large, or
@@ -40,18 +33,15 @@ def input_file(
     except (OSError, ValueError) as fault:
         message, hint = f"it cannot be read ({getattr(fault, 'strerror', None) or fault}).", "Check its permissions."
         raise refusal(message, where=where, hint=hint) from fault
-    status = os.fstat(descriptor)
-    message = hint = ""
+    status, message = os.fstat(descriptor), ""
     if S_ISDIR(status.st_mode):
         message, hint = f"it is a directory, expected {expected}.", "Give the path of the file itself."
     elif not S_ISREG(status.st_mode):
         message, hint = f"it is a device or pipe, expected {expected}.", "Save what it gives to a file, and give that."
     elif status.st_size > most:
         size, unit = next(((size, unit) for size, unit in _UNITS if most >= size), (1, "bytes"))
-        message, hint = (
-            f"it is larger than {most / size:.3g} {unit}, expected {expected}.",
-            "Check the path, or split it.",
-        )
+        message = f"it is larger than {most / size:.3g} {unit}, expected {expected}."
+        hint = "Check the path, or split it."
     if message:
         os.close(descriptor)
         raise refusal(message, where=where, hint=hint)
@@ -75,11 +65,7 @@ def refuse(path: Path | str, message: str, hint: str, line: int | None = None, c
 
 
 def text_of(content: bytes, path: Path | str, hint: str, line: int = 1, offset: int | None = None) -> str:
-    """Text in UTF-8, without a byte order mark; its first line has the number ``line``.
-
-    Raises:
-        DataError: with the line of a byte that is none, and its place in the file where its ``offset`` is known.
-    """
+    """Text in UTF-8, without a byte order mark; a DataError names the line of a byte that is none, and its place."""
     text, at, fault = "", content.find(b"\0"), "a NUL byte{}, expected text"
     try:
         text = content.decode("utf-8").removeprefix("\ufeff")
@@ -95,11 +81,7 @@ def text_of(content: bytes, path: Path | str, hint: str, line: int = 1, offset: 
 
 @contextmanager
 def writing(place: Path, hint: str) -> Iterator[None]:
-    """What is done within writes a file or a folder.
-
-    Raises:
-        InputError: the operating system refused it.
-    """
+    """What is done within writes a file or a folder; an InputError where the operating system refuses it."""
     try:
         yield
     except OSError as fault:
@@ -108,12 +90,9 @@ def writing(place: Path, hint: str) -> Iterator[None]:
 
 
 def check_output(path: Path) -> None:
-    """What stands at an output's path must be nothing, or a regular file that may be replaced.
+    """Raise InputError unless nothing is at an output's path, or a regular file that may be replaced.
 
     Replacing a device would take it away, and through a link something else would be written than was named.
-
-    Raises:
-        InputError: it is a link, a directory, a device or a pipe.
     """
     try:
         mode = path.lstat().st_mode
@@ -146,40 +125,19 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def write_durably(path: Path, content: bytes) -> None:
-    """Write a file that nobody reads yet, or raise OSError and leave none."""
-    try:
-        with path.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
-
-
 def write_whole(path: Path, content: bytes) -> None:
     """Put a file in place so that a power loss leaves the earlier one or this one, whole.
 
     Raises:
         OSError: it could not be; the earlier file is as it was.
     """
-    staged = path.with_name(f"{STAGED}{path.name}")
-    write_durably(staged, content)
-    try:
-        os.replace(staged, path)
-    except BaseException:
-        staged.unlink(missing_ok=True)
-        raise
+    with staged({path: content}) as ready:
+        os.replace(ready[path], path)
     sync_folder(path.parent)
 
 
 def write_new(files: Mapping[Path, bytes]) -> None:
-    """Write files where none are.
-
-    Raises:
-        InputError: one is there already, or cannot be written; then none is written.
-    """
+    """``write_over`` where none of the files is there."""
     require_new(list(files))
     write_over(files)
 
@@ -200,17 +158,19 @@ def write_over(files: Mapping[Path, bytes]) -> None:
 
 
 @contextmanager
-def staged(files: Mapping[Path, bytes], hint: str) -> Iterator[dict[Path, Path]]:
+def staged(files: Mapping[Path, bytes], hint: str = "") -> Iterator[dict[Path, Path]]:
     """Files by their places, durable beside them; what is not moved from there is removed.
 
     Raises:
-        InputError: one cannot be written.
+        InputError: one cannot be written; OSError where no ``hint`` is given.
     """
     ready = {place: place.with_name(f"{STAGED}{place.name}") for place in files}
     try:
         for place, content in files.items():
-            with writing(place, hint):
-                write_durably(ready[place], content)
+            with writing(place, hint) if hint else nullcontext(), ready[place].open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
         yield ready
     finally:
         for source in ready.values():
@@ -219,7 +179,6 @@ def staged(files: Mapping[Path, bytes], hint: str) -> Iterator[dict[Path, Path]]
 
 
 def require_new(paths: Sequence[Path]) -> None:
-    """Raise InputError if any of the files is there."""
     for path in paths:
         if os.path.lexists(path):
             hint = "Give another --out, or --force to overwrite it."
