@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -119,7 +119,7 @@ LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The parser of libyaml where PyYAML was built with it: the same events and marks, some ten times faster."""
 
 _PLAIN_TAGS = frozenset((None, "tag:yaml.org,2002:map", "tag:yaml.org,2002:seq"))
-_TEXT_TAGS = frozenset(("!", "tag:yaml.org,2002:str"))
+_TEXT_TAGS = frozenset((None, "!", "tag:yaml.org,2002:str"))
 _TAB_INDENT = re.compile(r"^ *\t[ \t]*[^\s#]", re.MULTILINE)
 _UNPRINTABLE = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -179,99 +179,100 @@ def read_nodes(
             where=origin.at(text.count("\n", 0, match.start()) + 1),
             hint="Replace the tab by spaces.",
         )
-    builder = _Builder(origin, plain)
+    reader = _Reader(yaml.parse(text, Loader=loader), origin, plain)
     try:
-        for event in yaml.parse(text, Loader=loader):
-            builder.take(event)
+        return reader.document()
     except yaml.MarkedYAMLError as fault:
         mark = fault.problem_mark or fault.context_mark
         context = f" {fault.context}" if fault.context else ""
-        builder.refuse(
+        reader.refuse(
             f"this is not valid YAML: {fault.problem}{context}.",
             "Check indentation, colons, brackets and quotes on this line and the ones before it.",
             None if mark is None else mark.line + 1,
         )
     except (yaml.YAMLError, ValueError, OverflowError) as fault:
-        builder.refuse(f"this is not valid YAML: {fault}.", "Check quotes and escapes.", None)
-    return builder.root
+        reader.refuse(f"this is not valid YAML: {fault}.", "Check quotes and escapes.", None)
 
 
-@dataclass
-class _Open:
-    """A collection whose end has not been read."""
+class _Reader:
+    """Builds nodes out of the parser's events, from the top down: no deeper than ``MAX_DEPTH``."""
 
-    line: int
-    anchor: str | None
-    is_mapping: bool
-    entries: dict[str, Node] = field(default_factory=dict)
-    items: list[Node] = field(default_factory=list)
-    key: str | None = None
-    key_line: int = 0
-    size: int = 1
-    height: int = 1
-
-
-class _Builder:
-    """Builds nodes out of events, one at a time, with a stack of its own."""
-
-    def __init__(self, origin: Origin, plain: Callable[[str], Scalar]) -> None:
-        self.root: Node | None = None
-        self._origin, self._plain = origin, plain
-        self._stack: list[_Open] = []
+    def __init__(self, events: Iterator[Any], origin: Origin, plain: Callable[[str], Scalar]) -> None:
+        self._events, self._origin, self._plain = events, origin, plain
+        self._path: list[Step] = []  # to what is read
         self._anchors: dict[str, Node | None] = {}  # None: still open
-        self._documents = 0
 
     def refuse(self, message: str, hint: str, line: int | None) -> NoReturn:
-        steps: list[Step] = []
-        for level in self._stack:
-            if not level.is_mapping:
-                steps.append(len(level.items))
-            elif level.key is not None:
-                steps.append(level.key)
-        raise ConfigError(message, where=self._origin.at(line, (*self._origin.prefix, *steps)), hint=hint)
+        raise ConfigError(message, where=self._origin.at(line, (*self._origin.prefix, *self._path)), hint=hint)
 
-    def take(self, event: Any) -> None:
-        line = event.start_mark.line + 1
-        if isinstance(event, yaml.DocumentStartEvent):
-            self._documents += 1
-            if self._documents > 1:
+    def document(self) -> Node | None:
+        root: Node | None = None
+        for event in self._events:
+            if isinstance(event, yaml.DocumentStartEvent) and root is not None:
+                mark: Any = event.start_mark
+                line = mark.line + 1
                 self.refuse("a second document starts here, expected one.", "Remove the line '---'.", line)
-        elif isinstance(event, yaml.AliasEvent):
-            self._alias(event.anchor or "", line)
-        elif isinstance(event, yaml.ScalarEvent):
-            self._scalar(event, line)
-        elif isinstance(event, yaml.CollectionStartEvent):
-            self._open(event, line)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            self._close()
+            elif isinstance(event, yaml.NodeEvent):
+                root = self._node(event)
+        return root
 
-    def _alias(self, anchor: str, line: int) -> None:
-        self._refuse_as_key(line)
-        if anchor not in self._anchors:
-            self.refuse(f"the alias *{anchor} names no anchor.", f"Write &{anchor} before the value it means.", line)
-        node = self._anchors[anchor]
-        if node is None:
-            self.refuse(f"the alias *{anchor} stands inside what it names.", "Write the value out.", line)
-        self._add(replace(node, line=line))
+    def _node(self, event: Any) -> Node:
+        line, anchor = event.start_mark.line + 1, event.anchor
+        if isinstance(event, yaml.AliasEvent):
+            if anchor not in self._anchors:
+                hint = f"Write &{anchor} before the value it means."
+                self.refuse(f"the alias *{anchor} names no anchor.", hint, line)
+            if (node := self._anchors[anchor]) is None:
+                self.refuse(f"the alias *{anchor} stands inside what it names.", "Write the value out.", line)
+            return replace(node, line=line)
+        if isinstance(event, yaml.ScalarEvent):
+            try:
+                node = Node(self._origin, line, self._plain(event.value) if self._is_plain(event) else event.value)
+            except ScalarError as fault:
+                self.refuse(f"{fault}.", fault.hint, line)
+        else:
+            self._check_tag(event, _PLAIN_TAGS)
+            self._check_depth(len(self._path) + 1, line)
+            if anchor is not None:
+                self._anchors[anchor] = None
+            node = self._collection(event, line)
+        if anchor is not None:
+            self._anchors[anchor] = node
+        return node
 
-    def _scalar(self, event: Any, line: int) -> None:
-        if event.tag not in _TEXT_TAGS and event.tag is not None:
-            self._refuse_tag(event.tag, line)
-        is_plain = event.tag is None and event.implicit[0]
-        parent = self._stack[-1] if self._stack else None
-        if parent is not None and parent.is_mapping and parent.key is None:
-            self._key(parent, event.value, is_plain, line)
-            return
-        try:
-            value: Scalar = self._plain(event.value) if is_plain else event.value
-        except ScalarError as fault:
-            self.refuse(f"{fault}.", fault.hint, line)
-        node = Node(self._origin, line, value)
-        if event.anchor is not None:
-            self._anchors[event.anchor] = node
-        self._add(node)
+    def _collection(self, opening: Any, line: int) -> Node:
+        is_mapping = isinstance(opening, yaml.MappingStartEvent)
+        entries, items, size, height = dict[str, Node](), list[Node](), 1, 1
+        while True:
+            if not is_mapping:
+                self._path.append(len(items))
+            event = next(self._events)
+            if isinstance(event, yaml.CollectionEndEvent):
+                break
+            key_line = event.start_mark.line + 1
+            if is_mapping:
+                self._path.append(self._key(event, entries, key_line))
+                event = next(self._events)
+            node = self._node(event)
+            size, height = size + node.size, max(height, node.height + 1)
+            self._check_depth(len(self._path) + node.height, node.line)
+            if size > MAX_NODES:
+                hint = "Expand no aliases of aliases; keep measured data in a CSV file."
+                self.refuse(f"the file holds more than {MAX_NODES} values with its aliases expanded.", hint, node.line)
+            step = self._path.pop()
+            if is_mapping:
+                entries[str(step)] = replace(node, line=key_line)
+            else:
+                items.append(node)
+        if not is_mapping:
+            self._path.pop()
+        return Node(self._origin, line, entries if is_mapping else tuple(items), size, height)
 
-    def _key(self, parent: _Open, text: str, is_plain: bool, line: int) -> None:
+    def _key(self, event: Any, entries: Mapping[str, Node], line: int) -> str:
+        if not isinstance(event, yaml.ScalarEvent):
+            self._check_tag(event, _PLAIN_TAGS)
+            self.refuse("found a list, mapping or alias as a key, expected text.", "Write a plain name.", line)
+        text, is_plain = str(event.value), self._is_plain(event)
         if is_plain and text == "<<":
             hint = "Write the keys out, or put the shared part into a file named under 'extends'."
             self.refuse("merge keys (<<) are not read.", hint, line)
@@ -285,63 +286,28 @@ class _Builder:
                 self.refuse(f"the key {text!r} is read as {meaning}, expected text.", f'Quote it: "{text}".', line)
         if not text:
             self.refuse("found an empty key, expected a name.", "Name the key.", line)
-        if text in parent.entries:
-            first = parent.entries[text].line
-            parent.key = text  # so that the refusal names it
-            self.refuse(
-                f"the key {text!r} stands here and at line {first}, expected once.",
-                "Remove or rename one.",
-                line,
-            )
-        parent.key, parent.key_line = text, line
+        if text in entries:
+            first = entries[text].line
+            self._path.append(text)  # so that the refusal names it
+            stands = f"the key {text!r} stands here and at line {first}, expected once."
+            self.refuse(stands, "Remove or rename one.", line)
+        return text
 
-    def _open(self, event: Any, line: int) -> None:
-        if event.tag not in _PLAIN_TAGS:
-            self._refuse_tag(event.tag, line)
-        self._refuse_as_key(line)
-        if len(self._stack) >= MAX_DEPTH:
-            self._refuse_depth(line)
-        if event.anchor is not None:
-            self._anchors[event.anchor] = None
-        self._stack.append(_Open(line, event.anchor, isinstance(event, yaml.MappingStartEvent)))
+    def _is_plain(self, event: Any) -> bool:
+        """Whether a scalar is bare; text otherwise."""
+        self._check_tag(event, _TEXT_TAGS)
+        return event.tag is None and bool(event.implicit[0])
 
-    def _close(self) -> None:
-        level = self._stack.pop()
-        value = level.entries if level.is_mapping else tuple(level.items)
-        node = Node(self._origin, level.line, value, level.size, level.height)
-        if level.anchor is not None:
-            self._anchors[level.anchor] = node
-        self._add(node)
+    def _check_tag(self, event: Any, known: Collection[str | None]) -> None:
+        tag: Any = getattr(event, "tag", None)
+        if tag not in known:
+            shown = tag.replace("tag:yaml.org,2002:", "!!")
+            hint = "Remove it: a config holds plain values only."
+            self.refuse(f"found the tag {shown}, expected no tag.", hint, event.start_mark.line + 1)
 
-    def _add(self, node: Node) -> None:
-        if not self._stack:
-            self.root = node
-            return
-        parent = self._stack[-1]
-        parent.size += node.size
-        parent.height = max(parent.height, node.height + 1)
-        if len(self._stack) + node.height > MAX_DEPTH:
-            self._refuse_depth(node.line)
-        if parent.size > MAX_NODES:
-            hint = "Expand no aliases of aliases; keep measured data in a CSV file."
-            self.refuse(f"the file holds more than {MAX_NODES} values with its aliases expanded.", hint, node.line)
-        if parent.key is None:
-            parent.items.append(node)
-        else:
-            parent.entries[parent.key] = replace(node, line=parent.key_line)
-            parent.key = None
-
-    def _refuse_depth(self, line: int) -> NoReturn:
-        self.refuse(f"values are nested deeper than {MAX_DEPTH} levels.", "Flatten the config.", line)
-
-    def _refuse_as_key(self, line: int) -> None:
-        if self._stack and self._stack[-1].is_mapping and self._stack[-1].key is None:
-            self.refuse("found a list, mapping or alias as a key, expected text.", "Write a plain name.", line)
-
-    def _refuse_tag(self, tag: str, line: int) -> NoReturn:
-        shown = tag.replace("tag:yaml.org,2002:", "!!")
-        hint = "Remove it: a config holds plain values only."
-        self.refuse(f"found the tag {shown}, expected no tag.", hint, line)
+    def _check_depth(self, depth: int, line: int) -> None:
+        if depth > MAX_DEPTH:
+            self.refuse(f"values are nested deeper than {MAX_DEPTH} levels.", "Flatten the config.", line)
 
 
 _STEPS = re.compile(r'(?:"([^"]+)"|([^."\s]+))(?:\.|$)')
