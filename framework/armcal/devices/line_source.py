@@ -22,13 +22,11 @@ from armcal.io.lines import LOOPBACK, LineCutter, bound, port_of
 
 STANDARD_INPUT = "-"
 KINDS = "- (standard input), udp:PORT of this machine, or a file that another program writes"
-Begin = Literal["start", "end"]
-"""From where a file is read: ``end`` passes over what was in it before."""
+Begin = Literal["start", "end"]  # from where a file is read: ``end`` passes over what was in it before
 
 LONGEST_LINE_BYTES = 64 * 1024
 _CHUNK = 1 << 20
-_MOST_AT_ONCE = 16
-"""Chunks, or thousands of datagrams, that are taken at once; the rest waits."""
+_MOST_AT_ONCE = 16  # chunks, or thousands of datagrams, that are taken at once; the rest waits
 _BUFFER_BYTES = 4 << 20
 
 
@@ -50,11 +48,7 @@ SourceName = Annotated[str, BeforeValidator(_named)]
 
 
 def open_lines(name: str, begin: Begin) -> "LineSource":
-    """A source by its name.
-
-    Raises:
-        DeviceRefusedError: it is not there, or is taken.
-    """
+    """A source by its name; a DeviceRefusedError where it is not there, or is taken."""
     if name == STANDARD_INPUT:
         return InputLines()
     if (port := port_of(name)) is not None:
@@ -134,17 +128,14 @@ class UdpLines:
 
 
 class FileLines:
-    """Lines of a file that grows. One that was cut or replaced is read from its start, in a call of its own.
-
-    Attributes:
-        renewed: how often the file was cut or replaced.
-    """
+    """Lines of a file that grows. One that was cut or replaced is read from its start, in a call of its own."""
 
     ended = False
 
     def __init__(self, path: Path, begin: Begin) -> None:
         self._path = path
-        self._cutter, self._position, self.renewed = LineCutter(LONGEST_LINE_BYTES), 0, 0
+        self._cutter, self._position = LineCutter(LONGEST_LINE_BYTES), 0
+        self.renewed = 0  # how often the file was cut or replaced
         self._file = path.open("rb", buffering=0)
         if begin == "end":
             size = os.fstat(self._file.fileno()).st_size
@@ -163,7 +154,7 @@ class FileLines:
                 self._position += len(data)
                 lines += self._cutter.feed(data)
         except (OSError, ValueError):  # gone for now, or closed
-            return lines
+            pass
         return lines
 
     def close(self) -> None:

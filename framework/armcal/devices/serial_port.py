@@ -72,8 +72,7 @@ class SerialPort:
         Zero seconds gives what is there and does not wait.
         """
         try:
-            ready, _, _ = select.select([self._handle()], [], [], longest_s)
-            if not ready:
+            if not select.select([self._handle()], [], [], longest_s)[0]:
                 return b""
             data = os.read(self._handle(), _AT_ONCE)
         except BlockingIOError:
@@ -133,10 +132,7 @@ class SerialPort:
         elif number == errno.ENOENT:
             message, hint = "there is no such serial port.", "Plug the board in; python -m serial.tools.list_ports."
         elif number in (errno.EACCES, errno.EPERM):
-            message, hint = (
-                "this serial port may not be opened.",
-                "Join its group (dialout) and log in anew.",
-            )
+            message, hint = "this serial port may not be opened.", "Join its group (dialout) and log in anew."
         else:
             message, hint = f"this serial port cannot be opened ({fault}).", "Check that the path is a serial port."
         raise DeviceRefusedError(message, where=Location(path), hint=hint) from fault

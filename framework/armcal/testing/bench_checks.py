@@ -24,12 +24,11 @@ from armcal.errors import InputError
 from armcal.testing.checking import ContractError, NotRun, Subject, check, expect
 
 T = TypeVar("T")
-JOINTS, CHANNELS = ("q1", "q2"), ("arm.q1", "arm.q2")
-"""The joints that a device's ``EXAMPLE`` must know, and the channels of a joint stream."""
-_NEAR_RAD, _SAME_RAD, _REGISTERS = 0.02, 1e-9, 256
-"""So near to an angle must a board's pulses come; so near are equal angles."""
-_PATIENCE_S = 5.0
-"""Whoever takes longer than this to say what has come is waiting."""
+JOINTS = ("q1", "q2")  # that a device's ``EXAMPLE`` must know
+CHANNELS = ("arm.q1", "arm.q2")  # of a joint stream
+_NEAR_RAD, _SAME_RAD = 0.02, 1e-9  # so near to an angle must a board's pulses come; so near are equal angles
+_REGISTERS = 256
+_PATIENCE_S = 5.0  # whoever takes longer than this to say what has come is waiting
 _DAMAGED = (
     b"\xff\xfe\xfd broken\n",
     b"[" * 20_000 + b"\n",
@@ -136,9 +135,9 @@ class _MemoryLink:
 
 # --- live sources ---------------------------------------------------------------------------------------------------
 
+# What has come of each kind of source, and what it is opened with beside the clock.
 _TAKEN: Mapping[str, Callable[[Any], list[Any]]] = {"tracker": frames_of, "joints": samples_of, "camera": shots_of}
 _OPENED: Mapping[str, tuple[Any, ...]] = {"tracker": (), "joints": (CHANNELS,), "camera": ({},)}
-"""What has come of each kind of source, and what it is opened with beside the clock."""
 
 
 @check("tracker", "joints", "camera", needed=True)
