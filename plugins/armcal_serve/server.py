@@ -33,9 +33,6 @@ class Server:
     def run(self, socket: Path | None) -> None:
         """Load the calibration, which may take the compiler's time, and serve the socket, or standard input and output,
         until a signal asks for the end or no request can come any more.
-
-        Raises:
-            ArmcalError: the calibration cannot be used, or somebody serves the socket.
         """
         switched = sys.getswitchinterval()
         try:

@@ -48,14 +48,11 @@ class ParameterSettings(Settings):
 
 
 def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSource) -> Parameters:
-    """Parameters as a configuration wants them.
-
-    Raises:
-        ConfigError: a glob matches nothing, a unit is wrong, a prior is not positive, a value is out of bounds.
-    """
+    """Parameters as a configuration wants them."""
     at: Path = ("parameters",)
-    for key, glob in [*_indexed("free", settings.free), *_indexed("fixed", settings.fixed)]:
-        _matching(parameters, glob, source, (*at, *key))
+    for key, globs in (("free", settings.free), ("fixed", settings.fixed)):
+        for index, glob in enumerate(globs):
+            _matching(parameters, glob, source, (*at, key, index))
     parameters = with_values(parameters, settings.values, source, (*at, "values"))
     if settings.bounds in ("none", False):
         parameters = parameters.without_bounds()
@@ -170,10 +167,6 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
         return parse_quantity(text, dimension)
     except ValueError as fault:
         raise ConfigError(f"{block.name}: {fault}", where=where) from fault
-
-
-def _indexed(key: str, globs: tuple[str, ...]) -> list[tuple[Path, str]]:
-    return [((key, index), glob) for index, glob in enumerate(globs)]
 
 
 def _matching(parameters: Parameters, glob: str, source: ConfigSource | None, at: Path) -> tuple[str, ...]:

@@ -49,10 +49,8 @@ def read_plain(text: str) -> Scalar:
     """The value of an unquoted scalar.
 
     Null, booleans (yes, no, on and off too), decimal and 0x integers and decimal fractions are read as YAML
-    1.1 does; everything else is text, dates included.
-
-    Raises:
-        ScalarError: a number in a spelling that YAML reads otherwise than it looks, or one not finite.
+    1.1 does; everything else is text, dates included. A ScalarError refuses a number that is not finite, or in a
+    spelling that YAML reads otherwise than it looks.
     """
     if text in _NULL:
         return None
@@ -115,8 +113,8 @@ MAX_NODES = 1_000_000
 
 Step = str | int
 
+# The parser of libyaml where PyYAML was built with it: the same events and marks, some ten times faster.
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""The parser of libyaml where PyYAML was built with it: the same events and marks, some ten times faster."""
 
 _PLAIN_TAGS = frozenset((None, "tag:yaml.org,2002:map", "tag:yaml.org,2002:seq"))
 _TEXT_TAGS = frozenset((None, "!", "tag:yaml.org,2002:str"))
@@ -163,9 +161,8 @@ def read_nodes(
 ) -> Node | None:
     """Parse one YAML document strictly; None if it holds nothing. ``plain`` reads a value without quotes.
 
-    Raises:
-        ConfigError: with line, field and mend: invalid YAML, tab indentation, duplicate or unclear keys,
-            tags, merge keys, several documents, surprising scalars, too deep or too large.
+    A ConfigError refuses, with line and field: invalid YAML, tab indentation, duplicate or unclear keys, tags, merge
+    keys, several documents, surprising scalars, and what is too deep or too large.
     """
     if match := _UNPRINTABLE.search(text):
         raise ConfigError(
@@ -341,11 +338,7 @@ def steps_of(name: str) -> tuple[str, ...] | None:
 
 
 def override(tree: Node, text: str) -> Node:
-    """The tree after one ``a.b=value``.
-
-    Raises:
-        ConfigError: the text is not of that form, or does not fit the tree.
-    """
+    """The tree after one ``a.b=value``."""
     assigned = assignment(text, "--set")
     if assigned is None:
         hint = "Write for example --set parameters.bounds=none; null as the value removes a key."
@@ -359,11 +352,7 @@ def override(tree: Node, text: str) -> Node:
 
 
 def assignment(text: str, option: str) -> tuple[tuple[str, ...], Node] | None:
-    """The keys and the value of ``a.b=value`` from the command line; None if it is not of that form.
-
-    Raises:
-        ConfigError: the value is not YAML.
-    """
+    """The keys and the value of ``a.b=value`` from the command line; None if it is not of that form."""
     name, equals, written = text.partition("=")
     steps = steps_of(name.strip())
     if not equals or steps is None or not written.strip():
@@ -373,11 +362,7 @@ def assignment(text: str, option: str) -> tuple[tuple[str, ...], Node] | None:
 
 
 def set_at(node: Node, steps: tuple[str, ...], value: Node) -> Node:
-    """The tree with another value at a path; null removes.
-
-    Raises:
-        ConfigError: the path leads into a number or text, or to an index that a list has not.
-    """
+    """The tree with another value at a path; null removes."""
     if not steps:
         return value
     step, rest = steps[0], steps[1:]

@@ -44,14 +44,10 @@ yaml.representer.Representer.add_representer(ConfigText, _as_plain_text)
 
 @dataclass(frozen=True)
 class ConfigSource:
-    """A merged configuration and where each value was written.
-
-    Attributes:
-        marks: file and line of the value at each path, such as ``("rows", 2, "d_mm")``; ``()`` is the whole.
-    """
+    """A merged configuration and where each value was written."""
 
     data: dict[str, Any]  # plain nested dicts, lists and scalars; every text is a `ConfigText`
-    marks: Mapping[tuple[Step, ...], Location]
+    marks: Mapping[tuple[Step, ...], Location]  # of the value at each path (``("rows", 2, "d_mm")``); ``()``: the whole
     path: Path  # the config that was asked for
     root: Path  # the directory that no path in it may leave
     files: tuple[Path, ...]  # every file read, the one asked for first
@@ -93,17 +89,11 @@ def load_config(
     check: Callable[[str], object] | None = None,
     content: bytes | None = None,
 ) -> ConfigSource:
-    """Read a YAML config with all that it extends, and apply overrides.
+    """Read a YAML config with all that it extends, and apply overrides, ``a.b=value`` each.
 
-    Args:
-        path: the config file.
-        overrides: ``a.b=value`` each, applied in order; a value is YAML, a list is indexed
-            (``rows.2.d_mm=3``), null removes a key, and a key that holds a dot is put in double quotes.
-        check: is given the text of the config before anything is made of it, and may raise.
-        content: what the config file holds, where it need not be there; such a config names no other file.
-
-    Raises:
-        ConfigError: what was found, where, and the mend.
+    A value is YAML, a list is indexed (``rows.2.d_mm=3``), null removes a key, and a key that holds a dot is put in
+    double quotes. ``check`` is given the text of the config before anything is made of it, and may raise. ``content``
+    is what the config holds, where its file need not be there; such a config names no other file.
     """
     path = Path(path)
     # A path below a file leads nowhere.
@@ -123,7 +113,16 @@ def _root_of(path: Path) -> Path:
 
 def as_source(tree: Node, path: Path, reader: Reader) -> ConfigSource:
     marks: dict[tuple[Step, ...], Location] = {}
-    return ConfigSource(_build(tree, (), marks), marks, path, reader.root, tuple(reader.files))
+
+    def build(node: Node, at: tuple[Step, ...]) -> Any:
+        marks[at] = node.origin.at(node.line, ())
+        if isinstance(node.value, dict):
+            return {key: build(entry, (*at, key)) for key, entry in node.value.items()}
+        if isinstance(node.value, tuple):
+            return [build(entry, (*at, index)) for index, entry in enumerate(node.value)]
+        return _scalar(node, at)
+
+    return ConfigSource(build(tree, ()), marks, path, reader.root, tuple(reader.files))
 
 
 def _refuse_file(path: Path, message: str, hint: str) -> NoReturn:
@@ -227,15 +226,6 @@ def parents_of(node: Node) -> list[ConfigText]:
     return texts
 
 
-def _build(node: Node, path: tuple[Step, ...], marks: dict[tuple[Step, ...], Location]) -> Any:
-    marks[path] = node.origin.at(node.line, ())
-    if isinstance(node.value, dict):
-        return {key: _build(entry, (*path, key), marks) for key, entry in node.value.items()}
-    if isinstance(node.value, tuple):
-        return [_build(entry, (*path, index), marks) for index, entry in enumerate(node.value)]
-    return _scalar(node, path)
-
-
 def _scalar(node: Node, path: tuple[Step, ...]) -> Any:
     if isinstance(node.value, str):
         return ConfigText(node.value, node.origin.at(node.line, path), node.origin.base_dir, node.origin.root)
@@ -260,9 +250,6 @@ def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple
     A variant is the rest of the config, then what it ``extends`` (an earlier variant by its name, files), then the
     overrides, then the values that it sets (``set: {a.b: value}``) and the entries that it adds to lists
     (``add: {parameters.free: [name]}``).
-
-    Raises:
-        ConfigError: what was found, where, and the mend.
     """
     path = Path(path)
     reader = Reader(_root_of(path))
@@ -281,12 +268,7 @@ def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple
 
 
 def _variant(
-    at: tuple[str, str, str],
-    node: Node,
-    base: Node,
-    earlier: dict[str, Node],
-    reader: Reader,
-    overrides: Sequence[str],
+    at: tuple[str, str, str], node: Node, base: Node, earlier: dict[str, Node], reader: Reader, overrides: Sequence[str]
 ) -> Node:
     entries = entries_of(node)
     unknown = sorted(set(entries) - set(_KEYS))
@@ -311,7 +293,7 @@ def _variant(
                 where=value.origin.at(value.line, (*at, "set")),
                 hint="A key that itself holds dots stands in double quotes: 'a.\"b.c\"': null.",
             )
-        tree = set_at(tree, steps, _with_prefix(value, steps))
+        tree = set_at(tree, steps, replace(value, origin=replace(value.origin, prefix=steps)))
     for steps, value in _by_path(entries.get("add"), (*at, "add")):
         tree = _added(tree, steps, value)
     return tree
@@ -352,7 +334,7 @@ def _added(tree: Node, steps: tuple[str, ...], value: Node) -> Node:
             hint="Use set: to replace it.",
         )
     kept = there.value if there is not None and isinstance(there.value, tuple) else ()
-    return set_at(tree, steps, _with_prefix(replace(value, value=(*kept, *more)), steps))
+    return set_at(tree, steps, replace(value, value=(*kept, *more), origin=replace(value.origin, prefix=steps)))
 
 
 def _at(tree: Node, steps: tuple[str, ...]) -> Node | None:
@@ -364,7 +346,3 @@ def _at(tree: Node, steps: tuple[str, ...]) -> Node | None:
         else:
             there = entries_of(there).get(step) if there else None
     return there
-
-
-def _with_prefix(node: Node, steps: tuple[str, ...]) -> Node:
-    return replace(node, origin=replace(node.origin, prefix=steps))

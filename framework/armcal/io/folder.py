@@ -29,11 +29,7 @@ class Reservation:
     ours: Collection[str]  # the files that may be in it; what was put in place last is moved away first
 
     def place(self, contents: Mapping[str, str | bytes]) -> None:
-        """Write a set of files; that of an earlier run moves to ``earlier/N``.
-
-        Raises:
-            InputError: the folder cannot be written; then it is as it was.
-        """
+        """Write a set of files; that of an earlier run moves to ``earlier/N``. Where it fails, all is as it was."""
         files = {
             self.folder / name: text.encode() if isinstance(text, str) else text for name, text in contents.items()
         }
@@ -70,11 +66,7 @@ class Reservation:
 
 @contextmanager
 def reserved(folder: Path, ours: Collection[str]) -> Iterator[Reservation]:
-    """Keep a directory for this run, made if it is not there; what a killed run had only begun to write is removed.
-
-    Raises:
-        InputError: it is not ours to write to, or another run writes to it.
-    """
+    """Keep a directory for this run, made if it is not there; what a killed run had only begun to write is removed."""
     check_folder(folder, ours)
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     lock = FileLock(folder / _LOCK, timeout=0)
@@ -96,11 +88,7 @@ def reserved(folder: Path, ours: Collection[str]) -> Iterator[Reservation]:
 
 
 def check_folder(folder: Path, ours: Collection[str]) -> None:
-    """Refuse a place that is not ours to write to.
-
-    Raises:
-        InputError: a file, or a directory with anything that is not called as ours are.
-    """
+    """Refuse a file, or a directory with anything that is not called as ours are."""
     where = Location(str(folder))
     try:
         is_folder = folder.is_dir()

@@ -57,12 +57,7 @@ class Entry:
 
 
 class KeptJournal:
-    """A journal that is read, by any process and also while it is written; nothing in it is changed.
-
-    Raises:
-        DataError: there is none, it is damaged, of another program, or of another version.
-        InputError: it cannot be read.
-    """
+    """A journal that is read, by any process and also while it is written; nothing in it is changed."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -105,11 +100,7 @@ class KeptJournal:
                 yield Entry(sequence, kind, self._parsed(content, f"entry {sequence}"))
 
     def until(self, sequence: int) -> tuple[Entry, tuple[Entry, ...]]:
-        """The last checkpoint at or before an entry, and the entries after it up to and with that one.
-
-        Raises:
-            InputError: the journal no longer reaches back to it, or does not yet reach to it.
-        """
+        """The last checkpoint at or before an entry, and the entries after it up to and with that one."""
         last, first = self.sequence, self._row("SELECT coalesce(min(sequence), 0) FROM entry")[0]
         checkpoint = self._checkpoint_at(sequence)
         if checkpoint is None or not max(first, 1) <= sequence <= last:
@@ -181,17 +172,9 @@ class KeptJournal:
 
 
 class Journal(KeptJournal):
-    """The only writer of a journal, which is begun or gone on with. Not for several threads.
+    """The only writer of a journal, which is begun (with a ``header``) or gone on with. Not for several threads.
 
-    Args:
-        folder: its folder, made if it is not there.
-        header: what a new one is begun with.
-        total_bytes: how large it may grow: the oldest entries go then, as far as a checkpoint stands in for them.
-
-    Raises:
-        InputError: another process writes it, or the folder cannot be written.
-        DataError: it is damaged, of another program, or of another version.
-        JournalFullError: there is no room to begin one.
+    ``total_bytes`` is how large it may grow: the oldest entries go then, as far as a checkpoint stands in for them.
     """
 
     def __init__(self, folder: str | Path, header: Mapping[str, Any], total_bytes: int = TOTAL_BYTES) -> None:
@@ -232,10 +215,8 @@ class Journal(KeptJournal):
     def record(self, kind: str, content: Any) -> int:
         """Write an entry and return its sequence number once it would outlast a power loss.
 
-        Raises:
-            ValueError, TypeError: the content is not JSON, or not finite; nothing was written.
-            JournalFullError: there is no room.
-            JournalFailedError: the disk fails.
+        Nothing is written where there is no room (``JournalFullError``) or where the content is not JSON, or not finite
+        (ValueError, TypeError). After a ``JournalFailedError`` nothing is written any more.
         """
         values = kind, _text(content)
         with self._writing():

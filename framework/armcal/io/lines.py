@@ -101,11 +101,7 @@ def port_of(text: str) -> int | None:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A socket that does not block.
-
-    Raises:
-        InputError: the port cannot be opened.
-    """
+    """A UDP socket that does not block."""
     where = Location(f"udp:{host}:{port}")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]

@@ -26,7 +26,7 @@ _OPTION = Location("--parallel")
 
 
 def unreported(fraction: float) -> None:
-    """Tells nobody."""
+    pass
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,7 @@ class Executor:
 
 
 def parse_executor(text: str) -> Executor:
-    """What ``--parallel`` says.
-
-    Raises:
-        InputError: it is no number of processes.
-    """
+    """What ``--parallel`` says."""
     text = text.strip()
     if text == "auto":
         return Executor()

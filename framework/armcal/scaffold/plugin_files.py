@@ -70,7 +70,6 @@ def staged(folder: Path) -> Iterator[Path]:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Texts by their path in a folder, in UTF-8 with plain line ends."""
     for name, text in texts.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

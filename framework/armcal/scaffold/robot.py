@@ -153,9 +153,8 @@ def robot_name(text: str) -> str:
     """The name of a new robot: of its folder and its experiments."""
     check_length(text, text)
     if not _NAME.fullmatch(text):
-        raise InputError(
-            f"found the name {text!r}, expected letters, digits, - and _.", hint="Begin with a letter, as in arm5."
-        )
+        fault = f"found the name {text!r}, expected letters, digits, - and _."
+        raise InputError(fault, hint="Begin with a letter, as in arm5.")
     return text
 
 
@@ -179,10 +178,8 @@ _NUMBERS = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length"}
 _OPTIONAL = {"beta": "angle", "mass": "mass", "com_x": "length", "com_y": "length", "com_z": "length"}
 _LIMITS = {f"{which} {dimension}": dimension for dimension in ("angle", "length") for which in ("lower", "upper")}
 _CHANNELS = {
-    name: RequestedChannel(
-        name, (name.partition(" ")[0],), dimension, required=name in _NUMBERS, is_evidence=name not in _NUMBERS
-    )
-    for name, dimension in (_NUMBERS | _OPTIONAL | _LIMITS).items()
+    name: RequestedChannel(name, (name.partition(" ")[0],), kind, name in _NUMBERS, is_evidence=name not in _NUMBERS)
+    for name, kind in (_NUMBERS | _OPTIONAL | _LIMITS).items()
 }
 _TEXTS = ("name", "joint", "type")
 _KINDS = {"": True, "revolute": True, "prismatic": False, "fixed": True}

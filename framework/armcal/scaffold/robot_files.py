@@ -38,16 +38,15 @@ GRAVITY_M_S2 = 9.81
 _SMALLEST_REACH_M = 0.01
 _TRIED_POSES = 60
 _NEARLY_HALF_A_TURN = 3.0
+# Of so many, chance makes one verdict in twenty warn; of 100 to 200 one in five: each finding has a level of its own.
 RECORDS_MADE = 600
-"""Of so many, chance makes one verdict in twenty warn; of 100 to 200 it is one in five, for each finding has a level of
-its own."""
 RESULTS = "runs/simulated"
 MOST_ERROR = 1.5  # times what the noise alone makes: what misses held-out tips by more has not found the arm
 NOISE_ALONE_MM = NOISE_MM * math.sqrt(8 / math.pi)  # mean length of three independent normal numbers
 SEED = 1
 LENGTH_SD_M, ANGLE_SD_RAD = 0.001, 0.003
+# Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there.
 UNSTATED_TARGET = {"tracker.target_x": 0.06, "tracker.target_y": -0.04, "tracker.target_z": 0.03}
-"""Of the reach: where a target sits whose place was not stated. Most sit beside the last axis, and show more there."""
 _MOST_SD = 2.0
 _SPRING = (0.5, 1.5)
 _UNITS = frozenset({"m", "rad", "rad_per_Nm"})
