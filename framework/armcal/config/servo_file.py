@@ -17,8 +17,7 @@ from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.settings import Settings, UnitOf
 from armcal.base.units import from_unit, to_unit
 from armcal.config.validate import validate
-from armcal.config.yaml_nodes import word
-from armcal.config.yaml_source import load_config
+from armcal.config.yaml_source import load_config, word
 from armcal.errors import ConfigError
 
 ALL_CALL = 0x70

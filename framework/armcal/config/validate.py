@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from armcal.base.settings import Fault, Settings
-from armcal.config.yaml_nodes import Step, dotted
-from armcal.config.yaml_source import ConfigSource, find_key
+from armcal.config.yaml_source import ConfigSource, Step, dotted, find_key
 from armcal.errors import ConfigError
 
 S = TypeVar("S", bound=Settings)

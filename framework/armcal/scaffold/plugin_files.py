@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from armcal.config.yaml_nodes import word
+from armcal.config.yaml_source import word
 from armcal.errors import InputError, Location
 from armcal.hooks import KINDS as HOOKS
 from armcal.io.plain_files import writing
