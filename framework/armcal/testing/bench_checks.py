@@ -4,12 +4,12 @@ No port is opened, for something may be plugged in. Live sources never wait; dam
 """
 
 import math
+import multiprocessing
 import socket
-import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, wait
 from contextlib import closing, suppress
 from copy import deepcopy
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -177,26 +177,18 @@ def damaged_bytes_are_passed_over_and_counted(s: Subject) -> None:
 
 def _within(call: Callable[[], T]) -> T:
     """What a call gives, if it does not wait."""
-    future = Future[T]()
-
-    def run() -> None:
-        try:
-            future.set_result(call())
-        except BaseException as fault:
-            future.set_exception(fault)
-
-    threading.Thread(target=run, daemon=True).start()
-    wait([future], _PATIENCE_S)
-    waits = f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once"
-    expect(future.done(), waits)
-    return future.result()
+    try:
+        return ThreadPool(1).apply_async(call).get(_PATIENCE_S)
+    except multiprocessing.TimeoutError as fault:
+        text = f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once"
+        raise ContractError(text) from fault
 
 
 def _settings_to_feed(s: Subject, path: Path) -> Mapping[str, Any]:
     fields = type(s.settings).model_fields
     if isinstance(s.example.get("port"), int):  # not that of a serial line
         return {"port": 0, **({"host": "127.0.0.1"} if "host" in fields else {})}
-    for name in ("path", "source"):
+    for name, feed in (("path", str(path)), ("source", "udp:0")):
         if name in fields:
-            return {name: str(path)}
+            return {name: feed}
     raise NotRun("its settings have no port, path or source by which the checks could feed it")
