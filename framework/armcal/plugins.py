@@ -141,8 +141,6 @@ def _import_file(module: str, file: Path) -> ModuleType:
 
 @dataclass(frozen=True)
 class Component:
-    """Something a configuration can name."""
-
     kind: str
     name: str
     target: str  # module:attribute
@@ -151,7 +149,6 @@ class Component:
     module: str = ""  # what that entry point names
 
     def load(self) -> Any:
-        """The component's class."""
         named = f"the {_kind_name(self.kind)} {self.name!r}"
         try:
             return resolve_name(self.target)
@@ -164,8 +161,6 @@ class Component:
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """One entry point or file."""
-
     name: str
     module: str
     distribution: str  # that it came with; of a file its name; empty if none
@@ -201,7 +196,6 @@ class PluginRegistry:
         return index
 
     def find(self, kind: str, name: str) -> Component:
-        """The component of that kind and name."""
         components = self._by_name.get((kind, name), [])
         if len(components) > 1:
             offered = " and ".join(f"{c.plugin} ({c.target})" for c in components)
@@ -316,7 +310,6 @@ def _registered(chosen: tuple[tuple[PluginInfo, EntryPoint | ModuleType], ...]) 
 
 
 def _announced(manager: pluggy.PluginManager, plugin: PluginInfo, module: Any) -> list[Component]:
-    """Register a plugin, and what it announces."""
     _require_marks(module)
     manager.register(module, f"{plugin.name} ({plugin.module})")
     announced: list[Component] = []

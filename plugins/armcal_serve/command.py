@@ -118,7 +118,6 @@ class Server:
         return as_line(refusal(None, fault)).encode()
 
     def status(self) -> Mapping[str, Any]:
-        """The answer to a request for the status."""
         served, file = self._served, self._file
         return {
             "armcal_serve": VERSION,

@@ -48,7 +48,6 @@ class ParameterSettings(Settings):
 
 
 def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSource) -> Parameters:
-    """Parameters as a configuration wants them."""
     at: Path = ("parameters",)
     for key, globs in (("free", settings.free), ("fixed", settings.fixed)):
         for index, glob in enumerate(globs):

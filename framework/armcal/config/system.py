@@ -98,8 +98,6 @@ ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2, on the earth with z up, where i
 
 @dataclass(frozen=True)
 class System:
-    """What is calibrated and measured."""
-
     arms: Mapping[str, Arm]  # by instance name
     measurements: Mapping[str, Measurement]  # by instance name
     statics: StaticsSettings  # as stated
@@ -244,7 +242,6 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
 
 
 def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measurements: Mapping[str, Measurement]) -> None:
-    """Refuse a lender that is not there, that borrows itself, or whose parameters mean something else."""
     lender, others = measurements.get(str(borrower.lender)), [name for name in measurements if name != at[-1]]
     if lender is None or borrower.lender == at[-1]:
         source.refuse(

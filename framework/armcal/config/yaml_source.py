@@ -133,9 +133,7 @@ def dotted(path: tuple[Step, ...]) -> str:
 
 @dataclass(frozen=True)
 class Origin:
-    """What a text was read from."""
-
-    label: str  # the file's name for people, or the command line's argument
+    label: str  # of what a text was read from: the file's name for people, or the command line's argument
     base_dir: Path  # what relative paths in it are relative to
     root: Path | None = None  # the directory that paths in it may not leave; None: anywhere
     numbered: bool = True  # whether its lines mean anything to the user
@@ -342,7 +340,6 @@ def steps_of(name: str) -> tuple[str, ...] | None:
 
 
 def override(tree: Node, text: str) -> Node:
-    """The tree after one ``a.b=value``."""
     assigned = assignment(text, "--set")
     if assigned is None:
         hint = "Write for example --set parameters.bounds=none; null as the value removes a key."
@@ -579,7 +576,6 @@ def _mapping(node: Node | None, origin: Origin) -> Node:
 
 
 def parents_of(node: Node) -> list[ConfigText]:
-    """The names under ``extends``."""
     named = entries_of(node).get("extends")
     if named is None:
         return []
@@ -672,7 +668,6 @@ def _without(tree: Node, section: str) -> Node:
 
 
 def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ...], Node]]:
-    """The values of a mapping whose keys are dotted names."""
     if node is None or node.value is None:
         return []
     variants = []

@@ -20,8 +20,6 @@ class Clock(Protocol):
 
 
 class RealClock(Clock):
-    """The machine's own."""
-
     @override
     def now(self) -> float:
         return time.monotonic()

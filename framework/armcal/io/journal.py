@@ -88,7 +88,6 @@ class KeptJournal:
 
     @property
     def checkpoint(self) -> Entry | None:
-        """The newest one."""
         return self._checkpoint_at(self.sequence)
 
     def entries(self, after: int = 0, until: int | None = None) -> Iterator[Entry]:

@@ -47,10 +47,7 @@ def short_address(path: Path) -> Iterator[str]:
 def vacate(path: Path, taken: str, hint: str) -> None:
     """Take away a socket that nobody serves any more.
 
-    ``taken`` is the sentence for one that somebody serves, ``hint`` says which option to change.
-
-    Raises:
-        InputError: somebody serves it, or something else is there.
+    ``taken`` is what an InputError says of one that somebody serves, ``hint`` which option to change.
     """
     where = Location(str(path))
     try:
@@ -70,11 +67,7 @@ def vacate(path: Path, taken: str, hint: str) -> None:
 
 
 class JsonClient(contextlib.ExitStack):
-    """A connection to a server, for requests one after another.
-
-    Raises:
-        OSError: nobody answers at the path.
-    """
+    """A connection to a server, for requests one after another. OSError: nobody answers, or not in time."""
 
     def __init__(self, path: Path, timeout_s: float = 30.0) -> None:
         super().__init__()
@@ -89,11 +82,6 @@ class JsonClient(contextlib.ExitStack):
         self._answers = self.enter_context(self._connection.makefile("rb"))
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The answer.
-
-        Raises:
-            OSError: the server went away, or takes too long (TimeoutError).
-        """
         self._connection.sendall(json.dumps(request).encode() + b"\n")
         line = self._answers.readline()
         if not line:
@@ -170,11 +158,7 @@ class JsonServer:
         return not self._waiting and not any([*self._clients.values()])
 
     def listen(self, path: Path, taken: str, hint: str) -> None:
-        """Serve a socket; one that nobody serves any more is replaced. ``taken`` and ``hint`` are as of ``vacate``.
-
-        Raises:
-            InputError: somebody serves it, something else is there, or it cannot be made.
-        """
+        """Serve a socket; one that nobody serves any more is replaced. ``taken`` and ``hint`` are as of ``vacate``."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             with short_address(path) as address:
@@ -297,7 +281,6 @@ class JsonServer:
         del self._clients[client]
 
     def _take(self, wait_s: float) -> None:
-        """Begin what was asked."""
         with contextlib.suppress(queue.Empty):
             while True:
                 line, arrived, answer = self._asked.get(timeout=wait_s)

@@ -69,7 +69,6 @@ class StandardOutput:
         self.closed = stream is None  # whether the reader is gone
 
     def write(self, line: str) -> None:
-        """One line, without its end."""
         if self._stream is None or self.closed:
             return
         data = memoryview((b"\n" if self._begun else b"") + line.encode() + b"\n")
@@ -101,7 +100,6 @@ def port_of(text: str) -> int | None:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A UDP socket that does not block."""
     where = Location(f"udp:{host}:{port}")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]

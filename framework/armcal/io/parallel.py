@@ -41,12 +41,7 @@ class Executor:
     worth_s: float = 6.0  # starting worker processes takes a second or two: not worth it for less work than this
 
     def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
-        """``work`` of each task, in order; the first exception of any ends it and is raised as it was.
-
-        Raises:
-            InputError: a task cannot be sent to another process.
-            ArmcalError: a worker process ended without an answer.
-        """
+        """``work`` of each task, in order; the first exception of any ends it and is raised as it was."""
         results: list[R] = []
         began = time.perf_counter()
         for number, task in enumerate(tasks):
@@ -97,7 +92,6 @@ class Executor:
 
 
 def parse_executor(text: str) -> Executor:
-    """What ``--parallel`` says."""
     text = text.strip()
     if text == "auto":
         return Executor()

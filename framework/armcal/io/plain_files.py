@@ -28,10 +28,6 @@ def input_file(
     """The file, opened to be read; ``most`` is how many bytes it may have, ``expected`` what it should be.
 
     A pipe is opened without waiting for its writer, and refused like a device: neither says how much it holds.
-
-    Raises:
-        InputError: of the kind ``refusal``: there is none, it is a directory, a device or a pipe, it is too large, or
-            it may not be read.
     """
     where = Location(str(path))
     try:
@@ -135,28 +131,19 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Put a file in place so that a power loss leaves the earlier one or this one, whole.
-
-    Raises:
-        OSError: it could not be; the earlier file is as it was.
-    """
+    """Put a file in place so that a power loss, or an OSError, leaves the earlier one or this one, whole."""
     with staged({path: content}) as ready:
         os.replace(ready[path], path)
     sync_folder(path.parent)
 
 
 def write_new(files: Mapping[Path, bytes]) -> None:
-    """``write_over`` where none of the files is there."""
     require_new(list(files))
     write_over(files)
 
 
 def write_over(files: Mapping[Path, bytes]) -> None:
-    """Write files, over those that are there, once all of them are on the disk beside their places.
-
-    Raises:
-        InputError: one cannot be written; as long as that was for want of room, none is.
-    """
+    """Write files, over those that are there, once all of them are on the disk beside their places."""
     hint = "Give --out a place that can be written, in a folder that is there."
     for place in files:
         check_output(place)
@@ -168,11 +155,7 @@ def write_over(files: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def staged(files: Mapping[Path, bytes], hint: str = "") -> Iterator[dict[Path, Path]]:
-    """Files by their places, durable beside them; what is not moved from there is removed.
-
-    Raises:
-        InputError: one cannot be written; OSError where no ``hint`` is given.
-    """
+    """Files by their places, durable beside them; what is not moved from there is removed. OSError with no ``hint``."""
     ready = {place: place.with_name(f"{STAGED}{place.name}") for place in files}
     try:
         for place, content in files.items():

@@ -91,7 +91,6 @@ class Row:
     is_fixed: bool = False  # no joint turns or slides it: a step of the base or of the tool
 
     def steps(self, convention: Convention) -> Steps:
-        """Where it leads to."""
         about_x, along_x = Rotation.from_euler("x", self.alpha), np.array([self.a, 0.0, 0.0])
         about_z, along_z = Rotation.from_euler("z", self.theta), np.array([0.0, 0.0, self.d])
         if convention == "standard":
@@ -167,7 +166,6 @@ _TAKEN = frozenset({"x", "y", "z", "id", "pose_id", *(name for name, _ in ENVIRO
 
 
 def robot_name(text: str) -> str:
-    """The name of a new robot: of its folder and its experiments."""
     check_length(text, text)
     if not _NAME.fullmatch(text):
         fault = f"found the name {text!r}, expected letters, digits, - and _."
@@ -203,7 +201,6 @@ _KINDS = {"": True, "revolute": True, "prismatic": False, "fixed": True}
 
 
 def read_rows(path: Path, registry: PluginRegistry) -> tuple[Row, ...]:
-    """The rows of a table, which is read as any table of records is."""
     made = registry.find("reader", "csv").load()
     layout = "Begin with a header such as alpha_deg,a_mm,theta_deg,d_mm."
     reader = made(made.Settings(path=ConfigText(str(path))))
@@ -323,7 +320,6 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
 
 
 def urdf_model(path: Path, tip: str | None, registry: PluginRegistry) -> Any:
-    """The arm model of a URDF; ``tip`` names its last link where the file leaves a choice."""
     made = registry.find("model", "urdf").load()
     try:
         return made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))

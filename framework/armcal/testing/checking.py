@@ -29,7 +29,6 @@ class Subject(SimpleNamespace):
         return self.made(self.settings, *arguments)
 
     def with_settings(self, **settings: Any) -> Any:
-        """Another one, of its example but for these settings."""
         return self.made(self.made.Settings.model_validate({**self.example, **settings}))
 
 

@@ -55,8 +55,6 @@ _PLAIN: Mapping[str, Any] = {  # as ``csv`` reads it, in the form of a reader's 
 
 
 class _Body(Tip):
-    """What has a pose's columns, for readers."""
-
     def channels(self) -> tuple[Channel, ...]:
         return (*super().channels(), *(Channel(f"q{axis}", "dimensionless") for axis in "wxyz"))
 
@@ -211,8 +209,6 @@ def of_a_sound_fit_it_gives_findings_or_none_and_none_is_bad(s: Subject) -> None
 
 @dataclass(frozen=True)
 class _Exact:
-    """An estimator that knows the truth."""
-
     solution: Solution
 
     def solve(self, problem: Problem, start: Array, progress: Any = None) -> Solution:
