@@ -116,17 +116,14 @@ class FramedLink(GuardedLink, Link):
         if places and len(waypoints) > most:
             text = f"found {len(waypoints)} waypoints of {len(places)} joints, expected at most {most}."
             raise DeviceRefusedError(text, where=self._where, hint="Leave out waypoints.")
-        channels = tuple(
-            framed.GuardedChannel(*place, min(max(int(counts_per_s[place] * _RATE_STEPS), 1), _LARGEST))
-            for place in places
-        )
+        channels = tuple((*place, min(max(int(counts_per_s[place] * _RATE_STEPS), 1), _LARGEST)) for place in places)
         ways = tuple(tuple(waypoint[place] for place in places) for waypoint in waypoints) if places else ()
         after_ms = min(max(round(after_s * 1000), 1), _LARGEST)
         self._ask(Kind.GUARD, framed.guard_payload(after_ms, channels, ways))
 
     @override
     def set_counts(self, targets: Mapping[tuple[int, int], tuple[int, int]]) -> None:
-        listed = [framed.ChannelTarget(*place, *registers) for place, registers in targets.items()]
+        listed = [(*place, *registers) for place, registers in targets.items()]
         for first in range(0, len(listed), _TARGETS_AT_ONCE):
             self._ask(Kind.SET, framed.set_payload(listed[first : first + _TARGETS_AT_ONCE]))
 
@@ -173,25 +170,25 @@ class FramedLink(GuardedLink, Link):
     def _read_reply(self, frame: Frame, kind: Kind, payload: bytes) -> bytes:
         try:
             reply = framed.read_reply(frame.payload)
-            refusal = framed.read_refusal(reply.content) if frame.kind == Kind.REFUSED else None
+            code, detail = framed.read_refusal(reply.content) if frame.kind == Kind.REFUSED else (None, 0)
         except ValueError as fault:
             raise DeviceError(
                 f"the board's answer cannot be read ({fault}).", where=self._where, hint="Load its firmware anew."
             ) from fault
-        if self._boots not in (None, reply.boots) or (refusal and refusal.code == Code.WRONG_BOOTS):
+        if self._boots not in (None, reply.boots) or code == Code.WRONG_BOOTS:
             self._port.close()
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
         self._boots, self._flags = reply.boots, reply.flags
         self._took_over |= Flag.TOOK_OVER in reply.flags
-        if refusal is None:
+        if code is None:
             return reply.content
-        if refusal.code == Code.TOOK_OVER:
+        if code == Code.TOOK_OVER:
             self._lose_to_board()
-        unknown = (f"it gives code {refusal.code}", "Load newer firmware.")
-        meaning, hint = _REFUSALS.get(refusal.code, unknown)
-        address, what = payload[0] if payload else 0, f"byte {refusal.detail}"
-        if kind == Kind.SET and 6 * refusal.detail < len(payload):
-            address, channel = payload[6 * refusal.detail :][:2]
+        unknown = (f"it gives code {code}", "Load newer firmware.")
+        meaning, hint = _REFUSALS.get(code, unknown)
+        address, what = payload[0] if payload else 0, f"byte {detail}"
+        if kind == Kind.SET and 6 * detail < len(payload):
+            address, channel = payload[6 * detail :][:2]
             what = f"channel {channel}"
         text = f"the board refuses {kind.name}: {meaning.format(what=what, address=f'0x{address:02x}')}."
         raise DeviceError(text, where=self._where, hint=hint)

@@ -85,11 +85,9 @@ class Loader:
         arm, statics, before = calibration.system.arms[name], calibration.system.statics, self._last.get(name)
         unserved = [f"{c.name} (effect {name}.{effect})" for effect, c in arm.declared if c.name != TEMPERATURE]
         if unserved:
-            raise ConfigError(
-                f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
-                where=Location(self.shown),
-                hint="Use armcal predict or armcal compensate, which read it from a column.",
-            )
+            text = f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state."
+            hint = "Use armcal predict or armcal compensate, which read it from a column."
+            raise ConfigError(text, where=Location(self.shown), hint=hint)
         heated = None
         if TEMPERATURE in arm.conditions:
             heated = self._compensator(calibration, name, (TEMPERATURE,), before.heated if before else None)

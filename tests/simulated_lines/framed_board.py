@@ -5,11 +5,12 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from armcal.devices.framed import MAX_PAYLOAD, VERSION, Code, Flag, Frame, FrameDecoder, GuardedChannel, Kind, encoded
+from armcal.devices.framed import MAX_PAYLOAD, VERSION, Code, Flag, Frame, FrameDecoder, Kind, encoded
 
 from tests.simulated_lines.framed_messages import (
     LATE,
     Guard,
+    GuardedChannel,
     Head,
     Hello,
     HelloReply,

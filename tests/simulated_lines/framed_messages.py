@@ -9,7 +9,7 @@ import struct
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Self
 
-from armcal.devices.framed import ChannelTarget, Flag, GuardedChannel
+from armcal.devices.framed import Flag
 
 LATE = 128
 """A sequence that is ahead of the last one by this or more, modulo 256, is an old frame that came late."""
@@ -17,6 +17,23 @@ LATE = 128
 _CHANNEL = struct.Struct("<BBHH")
 _GUARD_HEAD = struct.Struct("<HB")
 _GUARD_CHANNEL = struct.Struct("<BBH")
+
+
+class ChannelTarget(NamedTuple):
+    """ON and OFF counts of a channel; each is what the two registers hold, full-on and full-off bits included."""
+
+    address: int
+    channel: int
+    on: int
+    off: int
+
+
+class GuardedChannel(NamedTuple):
+    """A channel that the board drives by itself, and how fast at most, in sixteenths of a count per second."""
+
+    address: int
+    channel: int
+    rate: int
 
 
 class Head(NamedTuple):

@@ -34,9 +34,8 @@ Place = tuple[str | int, ...]
 def usable_address(address: int) -> int:
     """The address itself, or a ValueError where no board can have it."""
     if not ADDRESSES[0] <= address <= ADDRESSES[1] or address == ALL_CALL:
-        raise ValueError(
-            f"found the address 0x{address:02x}, expected 0x40 to 0x77 and not 0x70, to which all boards listen"
-        )
+        text = f"found the address 0x{address:02x}, expected 0x40 to 0x77"
+        raise ValueError(f"{text} and not 0x70, to which all boards listen")
     return address
 
 

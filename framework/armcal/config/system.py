@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pkgutil import resolve_name
 from typing import Any, Literal, TypeVar
 
@@ -143,14 +144,19 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
             moved = [frame for frame, joint in frame_names(carrier.nominal_chain).items() if joint]
             for setting, frame in carried.carriers.items():
                 if frame not in moved:
-                    source.refuse(
-                        (*at, setting),
-                        f"no frame that a joint of {carrier.name} moves is called {frame!r}.",
-                        f"Such frames are {', '.join(moved)}.",
-                    )
+                    text = f"no frame that a joint of {carrier.name} moves is called {frame!r}."
+                    source.refuse((*at, setting), text, f"Such frames are {', '.join(moved)}.")
     for name, measurement in measurements.items():
         if isinstance(measurement, Borrowing) and measurement.lender is not None:
-            _check_lender(source, ("measurements", name), measurement, measurements)
+            place, lender = ("measurements", name), measurements.get(measurement.lender)
+            if lender is None or measurement.lender == name:
+                text = f"found {measurement.lender!r}, whose parameters are to be used, expected another measurement."
+                others = ", ".join(other for other in measurements if other != name)
+                source.refuse(place, text, f"The others are {others or 'none'}.")
+            if isinstance(lender, Borrowing) and lender.lender is not None:
+                text = f"{measurement.lender} has the parameters of {lender.lender} itself."
+                source.refuse(place, text, f"Name {lender.lender}.")
+            _refusable(source, place, partial(measurement.check_lender, lender))
     description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
     return System(arms, measurements, settings.statics, description)
 
@@ -191,11 +197,9 @@ def build_component(
 
 def _broken(component: Component, fault: str) -> PluginError:
     file = plugin_files().get(component.plugin)
-    return BrokenPluginError(
-        f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}.",
-        where=Location(str(file)) if file else None,
-        hint=f"See armcal plugins check {component.plugin}.",
-    )
+    text = f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}."
+    hint = f"See armcal plugins check {component.plugin}."
+    return BrokenPluginError(text, where=Location(str(file)) if file else None, hint=hint)
 
 
 def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm, dict[str, Any]]:
@@ -239,19 +243,6 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     if settings.placement:
         described["placement"] = settings.placement.to_config()
     return arm, described
-
-
-def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measurements: Mapping[str, Measurement]) -> None:
-    lender, others = measurements.get(str(borrower.lender)), [name for name in measurements if name != at[-1]]
-    if lender is None or borrower.lender == at[-1]:
-        source.refuse(
-            at,
-            f"found {borrower.lender!r}, whose parameters are to be used, expected another measurement.",
-            f"The others are {', '.join(others) or 'none'}.",
-        )
-    if isinstance(lender, Borrowing) and lender.lender is not None:
-        source.refuse(at, f"{borrower.lender} has the parameters of {lender.lender} itself.", f"Name {lender.lender}.")
-    _refusable(source, at, lambda: borrower.check_lender(lender))
 
 
 def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettings], arm: Arm) -> None:

@@ -70,7 +70,24 @@ def read_plain(text: str) -> Scalar:
         if not math.isfinite(float(text)):
             raise ScalarError(f"{text} is too large to be a number", "Write a finite number.")
         return float(text)
-    _refuse_surprises(text)
+    quoted = f'or "{text}" if it is text'
+    if _NOT_FINITE.fullmatch(text):
+        raise ScalarError(f"{text} is not a finite number", f"Write a finite number, leave the key out, {quoted}.")
+    if match := _LOOSE_EXPONENT.fullmatch(text):
+        sign, digits, exponent_sign, exponent = match.groups()
+        digits = digits if "." in digits else f"{digits}.0"
+        digits = f"0{digits}" if digits.startswith(".") else digits
+        clear = f"{sign}{digits}e{exponent_sign or '+'}{exponent}"
+        raise ScalarError(f"{text} is text to YAML, not a number", f"Write {clear}, {quoted}.")
+    if _CLOCK.fullmatch(text):
+        raise ScalarError(f"YAML reads {text} in base 60", f"Write a number with its unit, for example 90 s, {quoted}.")
+    if _OCTAL.fullmatch(text):
+        digits = text.lstrip("+-0").replace("_", "")
+        decimal = f"{'-' if text.startswith('-') else ''}{digits}" if digits.isdecimal() else "a decimal number"
+        fault = f"YAML reads {text} as an octal, binary or hexadecimal number"
+        raise ScalarError(fault, f"Write {decimal}, {quoted}.")
+    if "_" in text and _UNDERSCORE.fullmatch(text):
+        raise ScalarError(f"{text} is a number with underscores", f"Write {text.replace('_', '')}, {quoted}.")
     return text
 
 
@@ -87,29 +104,6 @@ def word(text: str) -> str:
     """A text as a scalar of a file: bare where every YAML reader takes it for text, else in double quotes."""
     is_plain = _WORD.fullmatch(text) and text.lower() not in ("y", "n") and read_plain(text) == text
     return str(text) if is_plain else json.dumps(str(text), ensure_ascii=False)
-
-
-def _refuse_surprises(text: str) -> None:
-    quoted = f'or "{text}" if it is text'
-    if _NOT_FINITE.fullmatch(text):
-        raise ScalarError(f"{text} is not a finite number", f"Write a finite number, leave the key out, {quoted}.")
-    if match := _LOOSE_EXPONENT.fullmatch(text):
-        sign, digits, exponent_sign, exponent = match.groups()
-        digits = digits if "." in digits else f"{digits}.0"
-        digits = f"0{digits}" if digits.startswith(".") else digits
-        clear = f"{sign}{digits}e{exponent_sign or '+'}{exponent}"
-        raise ScalarError(f"{text} is text to YAML, not a number", f"Write {clear}, {quoted}.")
-    if _CLOCK.fullmatch(text):
-        mend = f"Write a number with its unit, for example 90 s, {quoted}."
-        raise ScalarError(f"YAML reads {text} in base 60", mend)
-    if _OCTAL.fullmatch(text):
-        digits = text.lstrip("+-0").replace("_", "")
-        sign = "-" if text.startswith("-") else ""
-        decimal = f"{sign}{digits}" if digits.isdecimal() else "a decimal number"
-        mend = f"Write {decimal}, {quoted}."
-        raise ScalarError(f"YAML reads {text} as an octal, binary or hexadecimal number", mend)
-    if "_" in text and _UNDERSCORE.fullmatch(text):
-        raise ScalarError(f"{text} is a number with underscores", f"Write {text.replace('_', '')}, {quoted}.")
 
 
 MAX_DEPTH = 50
@@ -143,6 +137,9 @@ class Origin:
         shown = dotted(self.prefix if path is None else path)
         return Location(self.label, line if self.numbered else None, shown or None)
 
+    def refuse(self, message: str, hint: str, line: int | None, path: tuple[Step, ...] | None = None) -> NoReturn:
+        raise ConfigError(message, where=self.at(line, path), hint=hint)
+
 
 @dataclass(frozen=True, slots=True)
 class Node:
@@ -167,17 +164,12 @@ def read_nodes(
     keys, several documents, surprising scalars, and what is too deep or too large.
     """
     if match := _UNPRINTABLE.search(text):
-        raise ConfigError(
-            f"found the control character U+{ord(match.group()):04X}, expected text.",
-            where=origin.at(text.count("\n", 0, match.start()) + 1),
-            hint="Delete it, or save the file as UTF-8 text.",
-        )
+        message = f"found the control character U+{ord(match.group()):04X}, expected text."
+        line = text.count("\n", 0, match.start()) + 1
+        origin.refuse(message, "Delete it, or save the file as UTF-8 text.", line)
     if match := _TAB_INDENT.search(text):
-        raise ConfigError(
-            "this line is indented with a tab, expected spaces.",
-            where=origin.at(text.count("\n", 0, match.start()) + 1),
-            hint="Replace the tab by spaces.",
-        )
+        line = text.count("\n", 0, match.start()) + 1
+        origin.refuse("this line is indented with a tab, expected spaces.", "Replace the tab by spaces.", line)
     reader = _Reader(yaml.parse(text, Loader=loader), origin, plain)
     try:
         return reader.document()
@@ -202,7 +194,7 @@ class _Reader:
         self._anchors: dict[str, Node | None] = {}  # None: still open
 
     def refuse(self, message: str, hint: str, line: int | None) -> NoReturn:
-        raise ConfigError(message, where=self._origin.at(line, (*self._origin.prefix, *self._path)), hint=hint)
+        self._origin.refuse(message, hint, line, (*self._origin.prefix, *self._path))
 
     def document(self) -> Node | None:
         root: Node | None = None
@@ -347,8 +339,7 @@ def override(tree: Node, text: str) -> Node:
         raise ConfigError(f"found {text!r}, expected a dotted name, '=' and a value.", where=where, hint=hint)
     steps, value = assigned
     if steps[0] == "extends":
-        hint = "Write it in the config."
-        raise ConfigError("'extends' is read from files only.", where=value.origin.at(None), hint=hint)
+        value.origin.refuse("'extends' is read from files only.", "Write it in the config.", None)
     return set_at(tree, steps, value)
 
 
@@ -370,19 +361,13 @@ def set_at(node: Node, steps: tuple[str, ...], value: Node) -> Node:
     if isinstance(node.value, tuple):
         items = list(node.value)
         if not (step.isascii() and step.isdecimal() and len(step) < 10 and int(step) < len(items)):
-            raise ConfigError(
-                f"found the index {step!r} into a list of {len(items)} values.",
-                where=value.origin.at(None),
-                hint=f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list.",
-            )
+            hint = f"Write an index from 0 to {len(items) - 1}." if items else "Override the whole list."
+            value.origin.refuse(f"found the index {step!r} into a list of {len(items)} values.", hint, None)
         items[int(step)] = set_at(items[int(step)], rest, value)
         return replace(node, value=tuple(items))
     if node.value is not None and not isinstance(node.value, dict):
-        raise ConfigError(
-            f"the key above {step!r} holds {str(node.value)[:60]!r}, expected a mapping or a list.",
-            where=value.origin.at(None),
-            hint="Override that key itself, or correct the name.",
-        )
+        message = f"the key above {step!r} holds {str(node.value)[:60]!r}, expected a mapping or a list."
+        value.origin.refuse(message, "Override that key itself, or correct the name.", None)
     entries = dict(entries_of(node))
     if not rest and value.value is None and step in entries:
         del entries[step]
@@ -532,7 +517,14 @@ class Reader:
             _refuse_file(path, f"more than {MAX_FILES} files extend one another.", "Merge some of them.")
         self.files.append(path)
         origin = Origin(str(path), path.parent, self.root)
-        own = _mapping(read_nodes(text, origin), origin)
+        own = read_nodes(text, origin)
+        if own is None or own.value is None:
+            hint = "Write at least one 'key: value' line."
+            origin.refuse("the file is empty, expected keys and values.", hint, None)
+        if not isinstance(own.value, dict):
+            kind = "a list" if isinstance(own.value, tuple) else f"the value {str(own.value)[:60]!r}"
+            hint = "Write 'key: value' lines; put a space after each colon."
+            origin.refuse(f"found {kind} at the top, expected keys and values.", hint, own.line)
         merged: Node | None = None
         for parent in parents_of(own):
             base = self.parent(parent, (*chain, resolved))
@@ -547,11 +539,8 @@ class Reader:
         resolved = resolve_path(text)
         if resolved in chain:
             circle = " -> ".join(p.name for p in (*chain[chain.index(resolved) :], resolved))
-            raise ConfigError(
-                f"the files extend one another in a circle: {circle}.",
-                where=text.location,
-                hint="Remove one of these 'extends'.",
-            )
+            message = f"the files extend one another in a circle: {circle}."
+            raise ConfigError(message, where=text.location, hint="Remove one of these 'extends'.")
         try:
             return self.tree(text.base_dir / text, chain)
         except ConfigError as fault:
@@ -561,20 +550,6 @@ class Reader:
             raise
 
 
-def _mapping(node: Node | None, origin: Origin) -> Node:
-    if node is None or node.value is None:
-        hint = "Write at least one 'key: value' line."
-        raise ConfigError("the file is empty, expected keys and values.", where=origin.at(None), hint=hint)
-    if not isinstance(node.value, dict):
-        kind = "a list" if isinstance(node.value, tuple) else f"the value {str(node.value)[:60]!r}"
-        raise ConfigError(
-            f"found {kind} at the top, expected keys and values.",
-            where=origin.at(node.line),
-            hint="Write 'key: value' lines; put a space after each colon.",
-        )
-    return node
-
-
 def parents_of(node: Node) -> list[ConfigText]:
     named = entries_of(node).get("extends")
     if named is None:
@@ -582,11 +557,8 @@ def parents_of(node: Node) -> list[ConfigText]:
     nodes = named.value if isinstance(named.value, tuple) else (named,)
     texts = [_scalar(n, ("extends",)) for n in nodes]
     if not all(isinstance(t, ConfigText) for t in texts) or len(set(texts)) < len(texts):
-        raise ConfigError(
-            "'extends' is neither a file name nor a list of different file names.",
-            where=named.origin.at(named.line, ("extends",)),
-            hint="Write for example 'extends: base.yaml'.",
-        )
+        message = "'extends' is neither a file name nor a list of different file names."
+        named.origin.refuse(message, "Write for example 'extends: base.yaml'.", named.line, ("extends",))
     return texts
 
 
@@ -637,11 +609,9 @@ def _variant(
     entries = entries_of(node)
     unknown = sorted(set(entries) - set(_KEYS))
     if unknown or not (isinstance(node.value, dict) or node.value is None):
-        raise ConfigError(
-            f"found {', '.join(unknown) or str(node.value)[:60]!r} in a variant, expected extends, set or add.",
-            where=node.origin.at(node.line, at),
-            hint=f"Write for example {at[2]}: {{extends: FILE, set: {{parameters.bounds: none}}}}.",
-        )
+        message = f"found {', '.join(unknown) or str(node.value)[:60]!r} in a variant, expected extends, set or add."
+        hint = f"Write for example {at[2]}: {{extends: FILE, set: {{parameters.bounds: none}}}}."
+        node.origin.refuse(message, hint, node.line, at)
     tree, files = base, False
     for place, parent in enumerate(parents_of(node)):
         if str(parent) in earlier:
@@ -652,14 +622,19 @@ def _variant(
         tree = override(tree, text)
     for steps, value in _by_path(entries.get("set"), (*at, "set")):
         if value.value is None and _at(tree, steps) is None:
-            raise ConfigError(
-                f"found nothing at {'.'.join(steps)} to remove.",
-                where=value.origin.at(value.line, (*at, "set")),
-                hint="A key that itself holds dots stands in double quotes: 'a.\"b.c\"': null.",
-            )
+            hint = "A key that itself holds dots stands in double quotes: 'a.\"b.c\"': null."
+            message = f"found nothing at {'.'.join(steps)} to remove."
+            value.origin.refuse(message, hint, value.line, (*at, "set"))
         tree = set_at(tree, steps, replace(value, origin=replace(value.origin, prefix=steps)))
     for steps, value in _by_path(entries.get("add"), (*at, "add")):
-        tree = _added(tree, steps, value)
+        there = _at(tree, steps)
+        more = value.value if isinstance(value.value, tuple) else (value,)
+        if there is not None and there.value is not None and not isinstance(there.value, tuple):
+            message = f"found {str(there.value)[:60]!r} at {'.'.join(steps)}, expected a list to add to."
+            value.origin.refuse(message, "Use set: to replace it.", value.line)
+        kept = there.value if there is not None and isinstance(there.value, tuple) else ()
+        own = replace(value, value=(*kept, *more), origin=replace(value.origin, prefix=steps))
+        tree = set_at(tree, steps, own)
     return tree
 
 
@@ -674,30 +649,12 @@ def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ..
     for name, value in entries_of(node).items():
         steps = steps_of(str(name))
         if steps is None or steps[0] in ("extends", at[0]):
-            raise ConfigError(
-                f"found {str(name)!r}, expected the dotted name of a value.",
-                where=value.origin.at(value.line, at),
-                hint="Write for example parameters.bounds: none.",
-            )
+            hint = "Write for example parameters.bounds: none."
+            value.origin.refuse(f"found {name!r}, expected the dotted name of a value.", hint, value.line, at)
         variants.append((steps, value))
     if not isinstance(node.value, dict):
-        where = node.origin.at(node.line, at)
-        raise ConfigError("expected dotted names with values.", where=where, hint="Write NAME: value lines below it.")
+        node.origin.refuse("expected dotted names with values.", "Write NAME: value lines below it.", node.line, at)
     return variants
-
-
-def _added(tree: Node, steps: tuple[str, ...], value: Node) -> Node:
-    """The tree with more entries in a list, which is made if it is not there."""
-    there = _at(tree, steps)
-    more = value.value if isinstance(value.value, tuple) else (value,)
-    if there is not None and there.value is not None and not isinstance(there.value, tuple):
-        raise ConfigError(
-            f"found {str(there.value)[:60]!r} at {'.'.join(steps)}, expected a list to add to.",
-            where=value.origin.at(value.line),
-            hint="Use set: to replace it.",
-        )
-    kept = there.value if there is not None and isinstance(there.value, tuple) else ()
-    return set_at(tree, steps, replace(value, value=(*kept, *more), origin=replace(value.origin, prefix=steps)))
 
 
 def _at(tree: Node, steps: tuple[str, ...]) -> Node | None:

@@ -5,7 +5,7 @@ Frames on a serial line: COBS [Cheshire1999], then a zero. Inside: type, sequenc
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
@@ -151,39 +151,22 @@ def read_greeting(content: bytes) -> Greeting:
     return Greeting(version, oscillator_hz, *texts)
 
 
-class Refusal(NamedTuple):
-    request: int
-    code: int
-    detail: int  # the index of what failed: a byte of WRITE, a target of SET
-
-
-def read_refusal(content: bytes) -> Refusal:
+def read_refusal(content: bytes) -> tuple[int, int]:
+    """The code, and the index of what failed: a byte of WRITE, a target of SET."""
     if len(content) != 3:
         raise ValueError(f"found {len(content)} bytes, expected 3")
-    return Refusal(*content)
+    return content[1], content[2]
 
 
-class ChannelTarget(NamedTuple):
-    """ON and OFF counts of a channel; each is what the two registers hold, full-on and full-off bits included."""
-
-    address: int
-    channel: int
-    on: int
-    off: int
-
-
-def set_payload(targets: Sequence[ChannelTarget]) -> bytes:
+def set_payload(targets: Iterable[tuple[int, int, int, int]]) -> bytes:
+    """Of address, channel, ON and OFF: what the two registers hold, full-on and full-off bits included."""
     return b"".join(struct.pack("<BBHH", *target) for target in targets)
 
 
-class GuardedChannel(NamedTuple):
-    address: int
-    channel: int
-    rate: int  # how fast the board drives it at most, in sixteenths of a count per second
-
-
-def guard_payload(after_ms: int, channels: Sequence[GuardedChannel], waypoints: Sequence[Sequence[int]]) -> bytes:
-    """After a silence: each waypoint has the counts (OFF minus ON) of all channels, in their order."""
+def guard_payload(after_ms: int, channels: Sequence[tuple[int, int, int]], waypoints: Sequence[Sequence[int]]) -> bytes:
+    """Of address, channel and the greatest rate (sixteenths of a count per second) of all that the board drives after a
+    silence; each waypoint has their counts (OFF minus ON), in this order.
+    """
     packed = b"".join(struct.pack("<BBH", *channel) for channel in channels)
     counts = [count for waypoint in waypoints for count in waypoint]
     head, tail = struct.pack("<HB", after_ms, len(channels)), struct.pack(f"<B{len(counts)}H", len(waypoints), *counts)

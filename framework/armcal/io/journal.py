@@ -103,11 +103,9 @@ class KeptJournal:
         last, first = self.sequence, self._row("SELECT coalesce(min(sequence), 0) FROM entry")[0]
         checkpoint = self._checkpoint_at(sequence)
         if checkpoint is None or not max(first, 1) <= sequence <= last:
-            raise InputError(
-                f"found no entry {sequence}; the journal goes from {first} to {last}.",
-                where=Location(str(self.path)),
-                hint="Give the sequence number of an entry that is kept.",
-            )
+            text = f"found no entry {sequence}; the journal goes from {first} to {last}."
+            hint = "Give the sequence number of an entry that is kept."
+            raise InputError(text, where=Location(str(self.path)), hint=hint)
         return checkpoint, tuple(self.entries(checkpoint.sequence, sequence))
 
     def verify(self) -> None:
@@ -184,11 +182,9 @@ class Journal(KeptJournal):
             make_folder(self.folder)
             self._lock.acquire()
         except Timeout as fault:
-            raise InputError(
-                "another process writes this journal already.",
-                where=Location(str(self.path)),
-                hint="End that process (see fuser), or give another folder; a journal can be read meanwhile.",
-            ) from fault
+            text = "another process writes this journal already."
+            hint = "End that process (see fuser), or give another folder; a journal can be read meanwhile."
+            raise InputError(text, where=Location(str(self.path)), hint=hint) from fault
         except OSError as fault:
             hint = "Give a writable folder on a disk that works."
             text = f"the journal cannot be written ({fault})."
@@ -234,7 +230,7 @@ class Journal(KeptJournal):
         text = _text(state)
         with self._writing():
             self._database.execute("INSERT OR REPLACE INTO checkpoint VALUES (?, ?)", (self.sequence, text))
-            while self._used() > self._total:
+            while _PAGE * (self._row("PRAGMA page_count")[0] - self._row("PRAGMA freelist_count")[0]) > self._total:
                 kept = self._row("SELECT sequence FROM checkpoint ORDER BY sequence LIMIT 1 OFFSET 1")
                 if kept is None:
                     break
@@ -257,9 +253,6 @@ class Journal(KeptJournal):
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 
-    def _used(self) -> int:
-        return _PAGE * int(self._row("PRAGMA page_count")[0] - self._row("PRAGMA freelist_count")[0])
-
     @contextmanager
     def _writing(self) -> Iterator[None]:
         if not self._failure:
@@ -271,17 +264,13 @@ class Journal(KeptJournal):
                     with suppress(sqlite3.Error):
                         self._database.rollback()
                 if fault.sqlite_errorcode == sqlite3.SQLITE_FULL or self._is_at_limit():
-                    raise JournalFullError(
-                        f"there is no room for an entry ({fault}); it was not written.",
-                        where=Location(str(self.path)),
-                        hint="Make room on the disk, then start again; what was acknowledged is kept.",
-                    ) from fault
+                    text = f"there is no room for an entry ({fault}); it was not written."
+                    hint = "Make room on the disk, then start again; what was acknowledged is kept."
+                    raise JournalFullError(text, where=Location(str(self.path)), hint=hint) from fault
                 self._failure = str(fault)
-        raise JournalFailedError(
-            f"the journal takes no more entries ({self._failure}). All that was acknowledged before is kept.",
-            where=Location(str(self.path)),
-            hint="Look at the disk and its quota, and for a program that holds the file locked; then start again.",
-        )
+        text = f"the journal takes no more entries ({self._failure}). All that was acknowledged before is kept."
+        hint = "Look at the disk and its quota, and for a program that holds the file locked; then start again."
+        raise JournalFailedError(text, where=Location(str(self.path)), hint=hint)
 
     def _is_at_limit(self) -> bool:
         """Whether a file is as large as this process may make one."""

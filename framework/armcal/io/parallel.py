@@ -51,14 +51,11 @@ class Executor:
                 spent = time.perf_counter() - began
                 hands_over = spent / number * remaining > self.worth_s and _picklable((work, task))
             if hands_over:
-                self._map_elsewhere(work, tasks, results, report)
                 break
             results.append(work(task))
-        report(1.0)
-        return results
-
-    def _map_elsewhere(self, work: Callable[[T], R], tasks: Sequence[T], results: list[R], report: Report) -> None:
-        """Append the results of the tasks that have none, from worker processes."""
+        else:
+            report(1.0)
+            return results
         import joblib
 
         tasks, count = tasks[len(results) :], len(tasks)
@@ -89,6 +86,8 @@ class Executor:
                 del os.environ[_SAFE_PATH]
             else:
                 os.environ[_SAFE_PATH] = before
+        report(1.0)
+        return results
 
 
 def parse_executor(text: str) -> Executor:

@@ -106,11 +106,9 @@ def check_output(path: Path) -> None:
     if S_ISREG(mode):
         return
     kind = "a link" if S_ISLNK(mode) else "a directory" if S_ISDIR(mode) else "a device or pipe"
-    raise InputError(
-        f"it is {kind}, expected a file or nothing there: {kind} is never replaced nor written through.",
-        where=Location(str(path)),
-        hint="Give the path of the file itself.",
-    )
+    text = f"it is {kind}, expected a file or nothing there: {kind} is never replaced nor written through."
+    hint = "Give the path of the file itself."
+    raise InputError(text, where=Location(str(path)), hint=hint)
 
 
 def make_folder(folder: Path) -> None:
@@ -198,32 +196,28 @@ class Reservation:
             self.folder / name: text.encode() if isinstance(text, str) else text for name, text in contents.items()
         }
         hint = "Give --out a writable directory with room on its disk."
-        with staged(files, hint) as ready, writing(self.folder, hint):
-            self._exchange(ready)
-
-    def _exchange(self, ready: Mapping[Path, Path]) -> None:
-        """Move files, one after another; all of them back if one cannot be moved, or at an interrupt."""
-        folder, kept = self.folder, self.folder
-        present = [name for name in self.ours if os.path.lexists(folder / name)]
-        if present:
-            number = 1
-            while (kept := folder / EARLIER / str(number)).exists():
-                number += 1
-            kept.mkdir(parents=True)
-        away = [(folder / name, kept / name) for name in reversed(present)]
-        done: list[tuple[Path, Path]] = []
-        try:
-            for source, target in (*away, *((source, place) for place, source in ready.items())):
-                done.append((source, target))
-                os.replace(source, target)
-        except BaseException:
-            for source, target in reversed(done):
-                with suppress(OSError):
-                    os.replace(target, source)
+        folder = kept = self.folder
+        with staged(files, hint) as ready, writing(folder, hint):
+            present = [name for name in self.ours if os.path.lexists(folder / name)]
             if present:
-                with suppress(OSError):
-                    kept.rmdir()
-            raise
+                number = 1
+                while (kept := folder / EARLIER / str(number)).exists():
+                    number += 1
+                kept.mkdir(parents=True)
+            away = [(folder / name, kept / name) for name in reversed(present)]
+            done: list[tuple[Path, Path]] = []
+            try:
+                for source, target in (*away, *((source, place) for place, source in ready.items())):
+                    done.append((source, target))
+                    os.replace(source, target)
+            except BaseException:  # one cannot be moved, or an interrupt: all of them back
+                for source, target in reversed(done):
+                    with suppress(OSError):
+                        os.replace(target, source)
+                if present:
+                    with suppress(OSError):
+                        kept.rmdir()
+                raise
         with suppress(OSError):  # they are in place
             sync_folder(folder)
 
@@ -271,8 +265,6 @@ def check_folder(folder: Path, ours: Collection[str]) -> None:
         raise InputError("it is a file, expected a directory.", where=where, hint="Give another --out.")
     foreign = sorted(name for name in names - {*ours, EARLIER} if not name.startswith(STAGED))
     if foreign:
-        raise InputError(
-            f"it holds files that are not of this kind of run ({', '.join(foreign[:3])}).",
-            where=where,
-            hint="Give --out a new or empty directory, or one of an earlier run.",
-        )
+        text = f"it holds files that are not of this kind of run ({', '.join(foreign[:3])})."
+        hint = "Give --out a new or empty directory, or one of an earlier run."
+        raise InputError(text, where=where, hint=hint)

@@ -84,10 +84,9 @@ def plugin_name(text: str, registry: PluginRegistry) -> str:
         mend = f"Leave {PREFIX} out: the package gets it by itself."
         raise InputError(f"found the name {text!r}, expected what comes after {PREFIX}.", hint=mend)
     if not _PLUGIN.fullmatch(name) or keyword.iskeyword(name):
-        raise InputError(
-            f"found the name {text!r}, expected a Python name of small letters, digits, - and _.",
-            hint="Begin with a letter, as in draw-wire.",
-        )
+        text = f"found the name {text!r}, expected a Python name of small letters, digits, - and _."
+        hint = "Begin with a letter, as in draw-wire."
+        raise InputError(text, hint=hint)
     taken = next((f"a plugin is called {name!r} already" for plugin in registry.plugins if plugin.name == name), "")
     for own in (component for component in registry.components if component.name == name):
         taken = f"the plugin {own.plugin!r} offers the {own.kind} {name!r} already"

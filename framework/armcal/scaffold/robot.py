@@ -223,11 +223,9 @@ def read_rows(path: Path, registry: PluginRegistry) -> tuple[Row, ...]:
             hint = "Only the first and the last row may be fixed: give a URDF, or rows whose frames stand at joints."
             raise DataError(text, where=place, hint=hint)
     if not FEWEST_JOINTS <= len(moving) <= MOST_JOINTS:
-        raise DataError(
-            f"found {plural(len(moving), 'joint')}, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
-            where=Location(str(path), line=table.rows[-1]),
-            hint="Give one line a joint, from the base to the tip.",
-        )
+        text = f"found {plural(len(moving), 'joint')}, expected {FEWEST_JOINTS} to {MOST_JOINTS}."
+        hint = "Give one line a joint, from the base to the tip."
+        raise DataError(text, where=Location(str(path), line=table.rows[-1]), hint=hint)
     check_joint_names(*zip(*moving, strict=True))
     return rows
 
@@ -289,15 +287,18 @@ _MOST_TRAVEL_RAD = 3.2  # a turning joint need not be measured over more than on
 def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegistry) -> Robot:
     """A robot from a URDF; ``tip`` names its last link where the file leaves a choice."""
     where = Location(str(path))
-    model = urdf_model(path, tip, registry)
+    made = registry.find("model", "urdf").load()
+    try:
+        model = made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))
+    except ValidationError as fault:
+        text = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
+        raise ConfigError(f"{text}.", where=where, hint="Correct the URDF, or choose --tip LINK.") from fault
     chain = numeric_chain(model, nominal_values(model))
     joints = tuple(_joint(joint, where) for joint in chain.joints if joint.mimic is None)
     if not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
-        raise DataError(
-            f"found {len(joints)} moving joints between root and tip, expected {FEWEST_JOINTS} to {MOST_JOINTS}.",
-            where=where,
-            hint="Name the link at the arm's end: --tip LINK.",
-        )
+        text = f"found {len(joints)} moving joints between root and tip, expected {FEWEST_JOINTS} to {MOST_JOINTS}."
+        hint = "Name the link at the arm's end: --tip LINK."
+        raise DataError(text, where=where, hint=hint)
     check_joint_names([joint.name for joint in joints], [where] * len(joints))
     priors: dict[str, Unit] = {}  # how far joints may be off the URDF; where the arm stands before the tracker has none
     for moved in chain.joints:  # a joint that follows another too
@@ -317,16 +318,6 @@ def robot_of_urdf(name: str, path: Path, tip: str | None, registry: PluginRegist
         tip=model.settings.tip,
         notes=model.settings.notes,
     )
-
-
-def urdf_model(path: Path, tip: str | None, registry: PluginRegistry) -> Any:
-    made = registry.find("model", "urdf").load()
-    try:
-        return made(made.Settings.model_validate({"path": str(path), **({"tip": tip} if tip else {})}))
-    except ValidationError as fault:
-        text = "; ".join(str(error["msg"]).removeprefix("Value error, ") for error in fault.errors(include_url=False))
-        hint = "Correct the URDF, or choose --tip LINK."
-        raise ConfigError(f"{text}.", where=Location(str(path)), hint=hint) from fault
 
 
 def _joint(joint: Joint, where: Location) -> RobotJoint:
@@ -393,10 +384,9 @@ def _fill(place: Path, robot: Robot, registry: PluginRegistry) -> MinimalSet:
     tips = np.array([exact[f"tracker.{axis}"] for axis in "xyz"])
     reach = float(np.linalg.norm(tips - tips.mean(axis=1, keepdims=True), axis=0).max())  # from the middle of all
     if not reach > _SMALLEST_REACH_M:
-        raise InputError(
-            f"in all poses the tip stays within {1000 * reach:.3g} mm.",
-            hint="Check the lengths a and d and their units.",
-        )
+        text = f"in all poses the tip stays within {1000 * reach:.3g} mm."
+        hint = "Check the lengths a and d and their units."
+        raise InputError(text, hint=hint)
     target = {} if robot.target else {name: share * reach for name, share in UNSTATED_TARGET.items()}
     true = _made_up(parameters, weight_N * reach, target, robot.widths)
     _write(place, robot, nothing, _as_text(parameters, true))
