@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
+from armcal.devices.framed import Frame, FrameDecoder, encoded
 
 from benchmarks.report import Row
 

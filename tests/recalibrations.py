@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from armcal.io import plain_files
 from armcal.io.journal import JOURNAL, Entry, KeptJournal
 from armcal_online.running.loop import Recalibration, StateReplayer
 from armcal_online.running.session import opened
@@ -111,13 +110,14 @@ class FullDisk:
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.full: set[str] = set()
-        self._write = plain_files.write_durably
-        patch.setattr(plain_files, "write_durably", self._written)
+        opened = Path.open
 
-    def _written(self, path: Path, content: bytes) -> None:
-        if any(part in path.name for part in self.full):
-            raise OSError(28, "No space left on device")
-        self._write(path, content)
+        def begun(path: Path, mode: str = "r", *given: Any, **more: Any) -> Any:
+            if mode == "wb" and any(part in path.name for part in self.full):
+                raise OSError(28, "No space left on device")
+            return opened(path, mode, *given, **more)
+
+        patch.setattr(Path, "open", begun)
 
 
 @contextmanager

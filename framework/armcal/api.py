@@ -22,15 +22,10 @@ from armcal.run.result import RunResult
 
 @dataclass(frozen=True)
 class Run:
-    """A finished calibration run.
+    """A finished calibration run."""
 
-    Attributes:
-        experiment: what was run.
-        result: everything that it knows.
-    """
-
-    experiment: experiment.Experiment
-    result: RunResult
+    experiment: experiment.Experiment  # what was run
+    result: RunResult  # everything that it knows
 
     @property
     def converged(self) -> bool:
@@ -63,10 +58,8 @@ class Run:
             NotConvergedError: the solver did not converge, so nothing is calibrated.
         """
         if not self.converged:
-            raise NotConvergedError(
-                f"{self.estimate.verdict.name} did not converge ({self.estimate.verdict.status}).",
-                hint=CHECK_THE_DATA,
-            )
+            text = f"{self.estimate.verdict.name} did not converge ({self.estimate.verdict.status})."
+            raise NotConvergedError(text, hint=CHECK_THE_DATA)
         text = sealed(results.calibration_content(self.result, self.experiment))
         return results.read_back(text, self.experiment.registry)
 

@@ -43,19 +43,12 @@ class Command(Protocol):
 
 @dataclass(frozen=True)
 class ComponentKind:
-    """One kind of component.
+    """One kind of component."""
 
-    Attributes:
-        hook: that registers it.
-        built_as: how armcal builds it.
-        protocol: ``module:class`` of what it must have.
-        beside: ``module:class`` of what it may have.
-    """
-
-    hook: str
-    built_as: str
-    protocol: str
-    beside: tuple[str, ...] = ()
+    hook: str  # that registers it
+    built_as: str  # how armcal builds it
+    protocol: str  # ``module:class`` of what it must have
+    beside: tuple[str, ...] = ()  # ``module:class`` of what it may have
 
 
 REGISTRATIONS = {
@@ -175,7 +168,4 @@ _KINDS = {
     "report_section": _kind("report_sections", "Section(result)", "report.run_document:SectionMaker"),
 }
 COMPONENTS: Mapping[str, ComponentKind] = MappingProxyType(_KINDS)
-"""The kinds of component."""
-
 KINDS: Mapping[str, str] = MappingProxyType({kind: component.hook for kind, component in COMPONENTS.items()})
-"""The kinds of component and the hook that registers each."""

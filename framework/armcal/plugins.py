@@ -16,10 +16,10 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from importlib import import_module, metadata
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -40,14 +40,13 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 
+# The environment variables: paths of files and folders, and names of plugins, both separated as ``PATH`` is.
 CHOSEN, DISABLED = "ARMCAL_PLUGINS", "ARMCAL_DISABLED_PLUGINS"
-"""The environment variables: paths of files and folders, and names of plugins, both separated as ``PATH`` is."""
 __path__: list[str] = []  # a package, whose modules the finder below finds
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _NO_PLUGINS = ("_", "test_", "conftest")
-_CALLED = re.compile(r"([\w.<>]+)\(\) (?:takes|missing|got) ")
-"""What Python says of a call whose arguments do not match."""
+_CALLED = re.compile(r"([\w.<>]+)\(\) (?:takes|missing|got) ")  # a call whose arguments do not match
 _MOST_SHOWN = 100
 
 # --- files ---------------------------------------------------------------------------------------------------------
@@ -141,8 +140,6 @@ def _import_file(module: str, file: Path) -> ModuleType:
 
 @dataclass(frozen=True)
 class Component:
-    """Something a configuration can name."""
-
     kind: str
     name: str
     target: str  # module:attribute
@@ -151,8 +148,7 @@ class Component:
     module: str = ""  # what that entry point names
 
     def load(self) -> Any:
-        """The component's class."""
-        named = f"the {_kind_name(self.kind)} {self.name!r}"
+        named = f"the {_SPOKEN.get(self.kind, self.kind)} {self.name!r}"
         try:
             return resolve_name(self.target)
         except (Exception, SystemExit) as fault:  # a plugin may fail in any way; the error names it and the reason
@@ -164,8 +160,6 @@ class Component:
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """One entry point or file."""
-
     name: str
     module: str
     distribution: str  # that it came with; of a file its name; empty if none
@@ -193,26 +187,18 @@ class PluginRegistry:
         """The components of one plugin, also where two plugins share a name."""
         return tuple(c for c in self.components if (c.plugin, c.module) == (plugin.name, plugin.module))
 
-    @cached_property
-    def _by_name(self) -> Mapping[tuple[str, str], list[Component]]:
-        index: dict[tuple[str, str], list[Component]] = {}
-        for component in self.components:
-            index.setdefault((component.kind, component.name), []).append(component)
-        return index
-
     def find(self, kind: str, name: str) -> Component:
-        """The component of that kind and name."""
-        components = self._by_name.get((kind, name), [])
+        components = [own for own in self.components if (own.kind, own.name) == (kind, name)]
         if len(components) > 1:
             offered = " and ".join(f"{c.plugin} ({c.target})" for c in components)
             hint = "Leave one of them out: --disable-plugin NAME."
             raise PluginError(f"the {kind} {name!r} is offered twice, by {offered}.", hint=hint)
         if components:
             return components[0]
-        known = sorted(n for k, n in self._by_name if k == kind)
+        known = sorted(own.name for own in self.components if own.kind == kind)
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known) or 'none'}."
-        if others := [spoken(k) for k, n in self._by_name if n == name]:
+        if others := [spoken(own.kind) for own in self.components if own.name == name]:
             hint = f"It is registered as {' and '.join(others)}."
         hint += " A plugin's file is loaded by --plugin FILE."
         if self.faults:
@@ -232,19 +218,17 @@ class PluginRegistry:
         return faults
 
 
-def _kind_name(kind: str) -> str:
-    names = {
-        "online": "online estimator",
-        "joints": "joint stream",
-        "camera": "live camera",
-        "bench": "simulated bench",
-        "report_section": "report section",
-    }
-    return names.get(kind, kind)
+_SPOKEN = {  # names of kinds that are two words
+    "online": "online estimator",
+    "joints": "joint stream",
+    "camera": "live camera",
+    "bench": "simulated bench",
+    "report_section": "report section",
+}
 
 
 def spoken(kind: str) -> str:
-    name = _kind_name(kind)
+    name = _SPOKEN.get(kind, kind)
     return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"
 
 
@@ -316,7 +300,6 @@ def _registered(chosen: tuple[tuple[PluginInfo, EntryPoint | ModuleType], ...]) 
 
 
 def _announced(manager: pluggy.PluginManager, plugin: PluginInfo, module: Any) -> list[Component]:
-    """Register a plugin, and what it announces."""
     _require_marks(module)
     manager.register(module, f"{plugin.name} ({plugin.module})")
     announced: list[Component] = []
@@ -445,8 +428,8 @@ def refuse(method: Callable[..., Any] | property, returned: str, expected: str) 
 
 # --- libraries that only parts of armcal need ----------------------------------------------------------------------
 
+# Of modules that are called otherwise than the distribution that they come with.
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "pyyaml"}
-"""Of modules that are called otherwise than the distribution that they come with."""
 
 
 def library(module: str, needed_by: str) -> Any:
@@ -467,9 +450,8 @@ def missing_library(fault: ImportError, needed_by: str = "this") -> ArmcalError:
         text = f"{needed_by} needs the library {module}, which is not installed."
         return PluginError(text, hint=f"Run pip install 'armcal[{extra}]'.")
     text = f"the library {fault.name} is missing." if absent else f"a library cannot be loaded ({fault})."
-    return ArmcalError(
-        text, hint="Install armcal anew with all it needs: pip install armcal. `armcal doctor` names what is broken."
-    )
+    hint = "Install armcal anew with all it needs: pip install armcal. `armcal doctor` names what is broken."
+    return ArmcalError(text, hint=hint)
 
 
 def extra_of(module: str) -> str | None:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from armcal.errors import InputError, Location
-from armcal.io.folder import check_folder
 from armcal.io.journal import Journal, has_journal
+from armcal.io.plain_files import check_folder
 
 Start = Literal["anew", "resume"]
 

@@ -29,7 +29,7 @@ from armcal.diagnose.data import check_reach
 from armcal.errors import ConfigError, DataError, Location, noted
 from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile
 from armcal.estimate.start import BETTER, FAR, pose_words
-from armcal.io.folder import reserved
+from armcal.io.plain_files import reserved
 from armcal.measure.checks import noticed, records_of
 from armcal.measure.csv_writer import csv_text
 from armcal.measure.groups import pose_numbers

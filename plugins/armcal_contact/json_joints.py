@@ -1,4 +1,4 @@
-"""The joint stream ``json_lines``: a JSON object a line, in datagrams, a pipe or a file that grows.
+"""The joint stream ``json_lines``: a JSON object a line, in datagrams or by standard input.
 
 One JSON object as joint readings.
 
@@ -19,9 +19,10 @@ from armcal.arm.joints import unknown_joint
 from armcal.base.settings import Settings
 from armcal.base.units import from_unit, split_suffix, units_of
 from armcal.devices.clock import Clock
-from armcal.devices.line_source import Begin, LineSource, SourceName, open_lines
+from armcal.devices.line_source import LineSource, SourceName, UdpLines, open_lines
 from armcal.devices.live import JointSample, JointStream
 from armcal.errors import ConfigError
+from armcal.io.lines import LOOPBACK
 from pydantic import Field, field_validator
 from typing_extensions import override
 
@@ -205,8 +206,7 @@ class JsonLinesJointSettings(Settings):
         joints: the source's own names by joint (``{j1: shoulder}``); joints that are not named have their own.
     """
 
-    source: SourceName  # ``-`` (standard input), ``udp:PORT``, or a file that another program writes
-    begin: Begin = "end"  # from where a file is read
+    source: SourceName  # ``-`` (standard input) or ``udp:PORT``
     joints: dict[str, str] = Field(default_factory=dict)
     values: str | None = None  # the key of a list of all joints in order, where they have no names
     unit: Literal["rad", "deg", "mrad"] | None = None  # of numbers whose names do not end in one
@@ -242,7 +242,12 @@ class JsonLinesJoints(JointStream):
             self._messages = JointMessages(channels, s.joints, s.values, s.unit, s.time)
         except ValueError as fault:
             raise ConfigError(f"bench.joints: {fault}.", hint="Correct bench.joints.joints.") from fault
-        self._source, self._clock, self._last = open_lines(s.source, s.begin), clock, None
+        self._source, self._clock, self._last = open_lines(s.source), clock, None
+
+    @property
+    def address(self) -> tuple[str, int]:
+        assert isinstance(self._source, UdpLines)
+        return LOOPBACK, self._source.port
 
     @override
     def samples(self) -> list[JointSample]:

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from armcal.base.arrays import Array
 from armcal.base.quaternions import rpy_of
-from armcal.config.yaml_nodes import Node, Origin, entries_of, read_nodes
+from armcal.config.yaml_source import Node, Origin, entries_of, read_nodes
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse
 from scipy.spatial.transform import Rotation

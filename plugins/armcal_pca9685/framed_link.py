@@ -1,16 +1,16 @@
 """A board that speaks the framed protocol: answers to everything, and looks after the arm by itself."""
 
 import os
+import struct
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NoReturn
 
 from armcal.base.settings import Duration
+from armcal.devices import framed
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.devices.framed import messages
-from armcal.devices.framed.frames import DELIMITER, MAX_PAYLOAD, Frame, FrameDecoder, encoded
-from armcal.devices.framed.messages import Code, Flag, Kind
+from armcal.devices.framed import DELIMITER, MAX_PAYLOAD, Code, Flag, Frame, FrameDecoder, Kind, encoded
 from armcal.devices.link import Counts, GuardedLink, Link, LinkIdentity
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
@@ -75,11 +75,11 @@ class FramedLink(GuardedLink, Link):
                         hint = "Check port and baud, and that the board runs the framed firmware."
                         raise DeviceLostError(text, where=self._where, hint=hint)
                     clock.sleep(_REPLY_S)
-            if hello.version != messages.VERSION:
-                text = f"found version {hello.version} of the protocol, expected {messages.VERSION}."
+            if hello.version != framed.VERSION:
+                text = f"found version {hello.version} of the protocol, expected {framed.VERSION}."
                 raise DeviceRefusedError(text, where=self._where, hint="Load the board's firmware anew.")
             if self._took_over:
-                self._ask(Kind.TAKE, messages.Take(self._boots or 0).pack())
+                self._ask(Kind.TAKE, struct.pack("<I", self._boots or 0))
         except BaseException:
             self._port.close()
             raise
@@ -87,11 +87,11 @@ class FramedLink(GuardedLink, Link):
 
     @override
     def write(self, address: int, data: bytes) -> None:
-        self._ask(Kind.WRITE, messages.Write(address, data).pack())
+        self._ask(Kind.WRITE, bytes((address,)) + data)
 
     @override
     def read(self, address: int, register: int, count: int) -> bytes:
-        data = self._ask(Kind.READ, messages.Read(address, register, count).pack())
+        data = self._ask(Kind.READ, bytes((address, register, count)))
         if len(data) != count:
             text = f"found {len(data)} bytes of 0x{address:02x}, expected {count}."
             raise DeviceError(text, where=self._where, hint="Load the board's firmware anew.")
@@ -116,29 +116,26 @@ class FramedLink(GuardedLink, Link):
         if places and len(waypoints) > most:
             text = f"found {len(waypoints)} waypoints of {len(places)} joints, expected at most {most}."
             raise DeviceRefusedError(text, where=self._where, hint="Leave out waypoints.")
-        channels = tuple(
-            messages.GuardedChannel(*place, min(max(int(counts_per_s[place] * _RATE_STEPS), 1), _LARGEST))
-            for place in places
-        )
+        channels = tuple((*place, min(max(int(counts_per_s[place] * _RATE_STEPS), 1), _LARGEST)) for place in places)
         ways = tuple(tuple(waypoint[place] for place in places) for waypoint in waypoints) if places else ()
         after_ms = min(max(round(after_s * 1000), 1), _LARGEST)
-        self._ask(Kind.GUARD, messages.Guard(after_ms, channels, ways).pack())
+        self._ask(Kind.GUARD, framed.guard_payload(after_ms, channels, ways))
 
     @override
     def set_counts(self, targets: Mapping[tuple[int, int], tuple[int, int]]) -> None:
-        listed = [messages.ChannelTarget(*place, *registers) for place, registers in targets.items()]
+        listed = [(*place, *registers) for place, registers in targets.items()]
         for first in range(0, len(listed), _TARGETS_AT_ONCE):
-            self._ask(Kind.SET, messages.Set(tuple(listed[first : first + _TARGETS_AT_ONCE])).pack())
+            self._ask(Kind.SET, framed.set_payload(listed[first : first + _TARGETS_AT_ONCE]))
 
     @override
     def close(self) -> None:
         self._port.close()
 
-    def _greet(self) -> messages.HelloReply | None:
+    def _greet(self) -> framed.Greeting | None:
         """None: nobody answers."""
-        reply = self._tried(Kind.HELLO, messages.Hello().pack())
+        reply = self._tried(Kind.HELLO, bytes((framed.VERSION,)))
         try:
-            return None if reply is None else messages.HelloReply.read(reply)
+            return None if reply is None else framed.read_greeting(reply)
         except ValueError as fault:
             text = f"the board's greeting cannot be read ({fault})."
             raise DeviceRefusedError(text, where=self._where, hint="Load the board's firmware anew.") from fault
@@ -172,27 +169,27 @@ class FramedLink(GuardedLink, Link):
 
     def _read_reply(self, frame: Frame, kind: Kind, payload: bytes) -> bytes:
         try:
-            head, rest = messages.read_head(frame.payload)
-            refusal = messages.Refusal.read(rest) if frame.kind == Kind.REFUSED else None
+            reply = framed.read_reply(frame.payload)
+            code, detail = framed.read_refusal(reply.content) if frame.kind == Kind.REFUSED else (None, 0)
         except ValueError as fault:
             raise DeviceError(
                 f"the board's answer cannot be read ({fault}).", where=self._where, hint="Load its firmware anew."
             ) from fault
-        if self._boots not in (None, head.boots) or (refusal and refusal.code == Code.WRONG_BOOTS):
+        if self._boots not in (None, reply.boots) or code == Code.WRONG_BOOTS:
             self._port.close()
             raise DeviceResetError("the board has started anew.", where=self._where, hint="Look at its power.")
-        self._boots, self._flags = head.boots, head.flags
-        self._took_over |= Flag.TOOK_OVER in head.flags
-        if refusal is None:
-            return rest
-        if refusal.code == Code.TOOK_OVER:
+        self._boots, self._flags = reply.boots, reply.flags
+        self._took_over |= Flag.TOOK_OVER in reply.flags
+        if code is None:
+            return reply.content
+        if code == Code.TOOK_OVER:
             self._lose_to_board()
-        unknown = (f"it gives code {refusal.code}", "Load newer firmware.")
-        meaning, hint = _REFUSALS.get(refusal.code, unknown)
-        address, what = payload[0] if payload else 0, f"byte {refusal.detail}"
-        targets = messages.Set.read(payload).targets if kind == Kind.SET else ()
-        if refusal.detail < len(targets):
-            address, what = targets[refusal.detail].address, f"channel {targets[refusal.detail].channel}"
+        unknown = (f"it gives code {code}", "Load newer firmware.")
+        meaning, hint = _REFUSALS.get(code, unknown)
+        address, what = payload[0] if payload else 0, f"byte {detail}"
+        if kind == Kind.SET and 6 * detail < len(payload):
+            address, channel = payload[6 * detail :][:2]
+            what = f"channel {channel}"
         text = f"the board refuses {kind.name}: {meaning.format(what=what, address=f'0x{address:02x}')}."
         raise DeviceError(text, where=self._where, hint=hint)
 

@@ -132,7 +132,6 @@ def _sliced(count: int, step: Callable[[range], None]) -> Iterator[None]:
 
 
 def command_rows(arm: ServedArm, commands: Commands, units: Units) -> list[dict[str, Any]]:
-    """Commands as they are answered, one row a target."""
     return [
         {
             **_commanded(arm, commands, i, units),

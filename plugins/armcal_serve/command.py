@@ -1,8 +1,10 @@
-"""``armcal serve``."""
+"""``armcal serve``: one thread answers, and one loads a calibration which takes the place of the one before."""
 
+import gc
 import sys
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +12,20 @@ import click
 from armcal.base.config_text import as_line
 from armcal.calibration.tool_expression import Point
 from armcal.cli.common import Console, accept, point, speaking, within
+from armcal.errors import ArmcalError
 from armcal.functions.batch_function import EvaluatorChoice
+from armcal.io.json_server import JsonServer
 from armcal.io.lines import StandardOutput
+from armcal.io.signals import Signals
 
-from armcal_serve.loading import Loader, Notify
-from armcal_serve.server import Server
+from armcal_serve.answers import Answerer
+from armcal_serve.loading import CalibrationFile, Loader, Notify
+from armcal_serve.protocol import MAX_LINE_BYTES, VERSION, refusal
 
 _ALWAYS = ("refused", "missing", "notice")  # Events that are written with --quiet too
+_STEP_S = 0.1  # How long it may take until a signal is noticed, when nothing else happens
+_GRACE_S = 10.0  # How long answers may take after the end was asked for
+_SWITCH_S = 5e-5  # So long the loading thread works on when there is something to answer
 
 
 @click.command()
@@ -63,3 +72,64 @@ def _notifier(console: Console) -> Notify:
             out.write(f"armcal serve: {sentence}")
 
     return notify
+
+
+class Server:
+    """Serves one calibration's file, which may be replaced at any time, at a socket or by standard input and output."""
+
+    def __init__(self, loader: Loader, notify: Notify) -> None:
+        self._notify = notify
+        self._file = CalibrationFile(loader, notify)
+        self._server = JsonServer(self._answering, self._refusal, MAX_LINE_BYTES)
+
+    def run(self, socket: Path | None) -> None:
+        """Load the calibration, which may take the compiler's time, and serve the socket, or standard input and output,
+        until a signal asks for the end or no request can come any more.
+        """
+        switched = sys.getswitchinterval()
+        try:
+            if socket is not None:
+                self._server.listen(socket, "a server is running here.", "Give another --socket.")
+            self._file.load()
+            status, by = self.status(), "standard input" if socket is None else f"socket {socket}"
+            content = {"calibration": status["calibration"], "arms": status["arms"], "by": [by]}
+            self._notify("ready", f"ready: {self._file.path} by {by}", content)
+            if socket is None:
+                self._server.attach(0, 1)
+            sys.setswitchinterval(_SWITCH_S)
+            gc.collect()
+            gc.freeze()
+            with warnings.catch_warnings(), self._file, Signals() as signals:
+                warnings.simplefilter("ignore")
+                while not signals.finish and not self._server.ended:
+                    self._server.serve(_STEP_S)
+                self._server.stop_reading()
+                ends = time.monotonic() + _GRACE_S
+                while not self._server.finished and time.monotonic() < ends:
+                    self._server.serve(_STEP_S)
+        finally:
+            sys.setswitchinterval(switched)
+            self._server.close()
+
+    def _answering(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
+        return self._served.begin(line, arrived, self.status)
+
+    def _refusal(self, fault: ArmcalError) -> bytes:
+        return as_line(refusal(None, fault)).encode()
+
+    def status(self) -> Mapping[str, Any]:
+        served, file = self._served, self._file
+        return {
+            "armcal_serve": VERSION,
+            "ok": True,
+            "calibration": served.tag,
+            "arms": {name: arm.shown for name, arm in served.arms.items()},
+            "file": {"path": str(file.path), "state": file.state, "why": file.why},
+            "requests": self._server.requests,
+            "clients": self._server.clients,
+        }
+
+    @property
+    def _served(self) -> Answerer:
+        assert self._file.served is not None
+        return self._file.served

@@ -33,24 +33,23 @@ _ORDINARY_C = 20.0
 _WORK_S, _REST_S = 0.001, 0.0015
 
 State = Literal["taken", "loading", "refused", "missing"]
+# Takes an event's name, a sentence and its fields, for the program that started the server.
 Notify = Callable[[str, str, Mapping[str, Any]], None]
-"""Takes an event's name, a sentence and its fields, for the program that started the server."""
 
 
 @dataclass
 class Loader:
     """Makes answerers of one arm's calibrations, each of which takes over what was compiled for the one before.
 
-    Attributes:
-        accept: whether one whose level is lost answers as any other; else the first is refused, and a later one
-            answers every request with that error, since those before it are no longer valid either.
+    Without ``accept``, the first whose level is lost is refused, and a later one answers every request with that error,
+    since those before it are no longer valid either.
     """
 
     shown: str  # the file, as it is called in messages
     within: str = ""  # a configuration whose plan has limits and clearance; empty: none
     point: Point = "tool"  # what forward and compensate are about: the tool's frame, or the target that was measured
     evaluator: EvaluatorChoice = "compiled"  # ``compiled`` where a compiler is found, or ``interpreted``
-    accept: bool = False
+    accept: bool = False  # whether one whose level is lost answers as any other
     sequence: int = field(init=False, default=0)  # of the calibration that was loaded last
     _arms: Mapping[str, Any] = field(init=False, default_factory=dict)  # its arms, as it describes them
     _options: dict[str, Options] = field(init=False, default_factory=dict)  # by arm, where there are limits
@@ -86,11 +85,9 @@ class Loader:
         arm, statics, before = calibration.system.arms[name], calibration.system.statics, self._last.get(name)
         unserved = [f"{c.name} (effect {name}.{effect})" for effect, c in arm.declared if c.name != TEMPERATURE]
         if unserved:
-            raise ConfigError(
-                f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state.",
-                where=Location(self.shown),
-                hint="Use armcal predict or armcal compensate, which read it from a column.",
-            )
+            text = f"the arm {name} changes with {', '.join(unserved)}, which a request cannot state."
+            hint = "Use armcal predict or armcal compensate, which read it from a column."
+            raise ConfigError(text, where=Location(self.shown), hint=hint)
         heated = None
         if TEMPERATURE in arm.conditions:
             heated = self._compensator(calibration, name, (TEMPERATURE,), before.heated if before else None)
@@ -164,18 +161,13 @@ class _Breaks:
 
 
 class CalibrationFile:
-    """A calibration's file, which may be replaced at any time; while it is entered a thread loads what replaces it.
-
-    Attributes:
-        state, why: of what is there now, and a sentence about it where it is not taken.
-        served: the answerer of the last one that could be loaded; None before the first.
-    """
+    """A calibration's file, which may be replaced at any time; while it is entered a thread loads what replaces it."""
 
     def __init__(self, loader: Loader, notify: Notify) -> None:
         self.path = Path(loader.shown)
-        self.state: State = "loading"
-        self.why = ""
-        self.served: Answerer | None = None
+        self.state: State = "loading"  # of what is there now
+        self.why = ""  # a sentence about it where it is not taken
+        self.served: Answerer | None = None  # of the last one that could be loaded
         self._loader, self._notify = loader, notify
         self._tried: tuple[int, ...] | None = None
         self._ends = threading.Event()
@@ -206,11 +198,7 @@ class CalibrationFile:
                 self._not_taken("refused", str(fault))
 
     def load(self) -> None:
-        """Load the file, if its bytes are not those that are served.
-
-        Raises:
-            ArmcalError: it cannot be used.
-        """
+        """Load the file, if its bytes are not those that are served."""
         before = self.served
         with input_file(self.path, MAX_BYTES, "a calibration.yaml", ConfigError) as file:
             data = file.read(MAX_BYTES)

@@ -138,7 +138,6 @@ class RawRequest:
 
 
 def parsed(line: bytes) -> Any:
-    """The JSON in a line."""
     try:
         return json.loads(line)
     except (ValueError, RecursionError) as fault:

@@ -98,11 +98,6 @@ class FrameCounter:
         self._older = []
         return ""
 
-    def begin_anew(self) -> None:
-        """The source is another one now: any number may come."""
-        self._last, self._older = None, []
-        self.restarts += 1
-
 
 class CountingTracker(Tracker):
     """A tracker that judges frames by their number, and counts by reason what it passes over."""

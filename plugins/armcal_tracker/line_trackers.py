@@ -1,4 +1,4 @@
-"""The tracker ``json_lines``: a frame a line, in a file that grows or in datagrams.
+"""The tracker ``json_lines``: a frame a line, in datagrams.
 
 One frame as a line of JSON.
 
@@ -12,18 +12,15 @@ import ipaddress
 import json
 import math
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, NoReturn, Self
+from typing import Annotated, Any, ClassVar, NoReturn
 
 from armcal.base.arrays import Array
-from armcal.base.settings import InputPath, Settings
+from armcal.base.settings import Settings
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceRefusedError
-from armcal.devices.line_source import LONGEST_LINE_BYTES, Begin, FileLines, UdpLines
+from armcal.devices.line_source import UdpLines
 from armcal.devices.live import TrackerFrame
-from armcal.errors import Location
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 from typing_extensions import override
 
 from armcal_tracker.frames import CountingTracker, Frame, FrameCounter, UnreadableError, body_pose
@@ -98,27 +95,16 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class JsonLinesSettings(Settings):
-    """Either a UDP ``port``, on an address of this machine, or the ``path`` of a file that another program writes.
+    """A UDP ``port``, on an address of this machine."""
 
-    A file is read from its ``end``: what was in it before is not what the tracker sees now.
-    """
-
-    port: Annotated[int, Field(ge=0, le=65535)] | None = None
+    port: Annotated[int, Field(ge=0, le=65535)]
     host: str = "127.0.0.1"
-    path: InputPath | None = None
-    begin: Begin = "end"
 
     @field_validator("host")
     @classmethod
     def _address(cls, value: str) -> str:
         ipaddress.IPv4Address(value)
         return value
-
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
-        if (self.port is None) == (self.path is None):
-            raise ValueError("expected either a UDP port (port: 5005) or a file (path: frames.jsonl)")
-        return self
 
 
 class JsonLinesTracker(CountingTracker):
@@ -130,8 +116,7 @@ class JsonLinesTracker(CountingTracker):
     def __init__(self, settings: JsonLinesSettings) -> None:
         super().__init__()
         self._settings = settings
-        self._source: FileLines | UdpLines | None = None
-        self._renewed = 0
+        self._source: UdpLines | None = None
 
     @property
     def address(self) -> tuple[str, int]:
@@ -141,25 +126,19 @@ class JsonLinesTracker(CountingTracker):
     @override
     def open(self, clock: Clock) -> None:
         self.close()
-        s = self._settings
-        self._source = UdpLines(s.host, s.port or 0) if s.path is None else _growing_file(s.path, s.begin)
-        self._clock, self._counter, self._renewed = clock, FrameCounter(), 0
+        self._source = UdpLines(self._settings.host, self._settings.port)
+        self._clock, self._counter = clock, FrameCounter()
 
     @override
     def frames(self) -> list[TrackerFrame]:
         if self._source is None or self._clock is None:
             return []
         now, lines = self._clock.now(), self._source.lines()
-        if isinstance(self._source, FileLines) and self._source.renewed != self._renewed:
-            self._renewed = self._source.renewed
-            self._counter.begin_anew()
         tracker_frames: list[TrackerFrame] = []
         for line in lines:
-            if line is not None and not line.strip():
+            if not line.strip():
                 continue
             try:
-                if line is None:
-                    raise UnreadableError(f"a line of more than {LONGEST_LINE_BYTES // 1024} KiB")
                 frame = json_frame(line)
             except UnreadableError as fault:
                 self._refused[str(fault)] += 1
@@ -173,14 +152,3 @@ class JsonLinesTracker(CountingTracker):
         if self._source is not None:
             self._source.close()
         self._source = None
-
-
-def _growing_file(path: Path, begin: Begin) -> FileLines:
-    where = Location(str(path))
-    try:
-        if path.exists() and not path.is_file():
-            raise DeviceRefusedError("it is not a regular file.", where=where, hint="Give a file that grows.")
-        return FileLines(path, begin)
-    except OSError as fault:
-        hint = "Start the program that writes it first, and check the path."
-        raise DeviceRefusedError(f"it cannot be read ({fault.strerror}).", where=where, hint=hint) from fault

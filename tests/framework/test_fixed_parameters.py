@@ -16,8 +16,7 @@ from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble
 from armcal.run.study import FixedParameters, fixed_parameters
-from armcal.scaffold.robot import read_rows, robot_of_rows
-from armcal.scaffold.robot_files import SIMULATED, write_robot
+from armcal.scaffold.robot import SIMULATED, read_rows, robot_of_rows, write_robot
 from click.testing import CliRunner
 
 REGISTRY = discover()

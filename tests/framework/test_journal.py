@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import random
 import shutil
 import sqlite3
@@ -111,9 +110,9 @@ def test_a_state_larger_than_the_limit_is_kept(tmp_path: Path) -> None:
         assert [entry.content for entry in journal.entries()] == [2]
 
 
-def test_a_second_writer_is_told_who_the_first_is(tmp_path: Path) -> None:
+def test_a_second_writer_is_refused(tmp_path: Path) -> None:
     with Journal(tmp_path, {}) as journal:
-        with pytest.raises(InputError, match=rf"process {os.getpid()} writes this journal already"):
+        with pytest.raises(InputError, match="another process writes this journal already"):
             Journal(tmp_path, {})
         assert journal.record("record", 1) == 1
     written(tmp_path, 1)
@@ -286,13 +285,10 @@ def test_what_is_no_journal_of_this_version_is_refused_and_left_as_it_is(tmp_pat
     database.close()
     (tmp_path / "text").mkdir()
     (tmp_path / "text" / JOURNAL).write_text("what I wrote\n" * 100)
-    (tmp_path / "before" / "journal").mkdir(parents=True)
-    (tmp_path / "before" / "journal" / "journal-00000001.log").write_text("0000000000000001 ...")
     for name, words in (
         ("later", "found journal format 9, expected 2"),
         ("other", "a database of another program"),
         ("text", "not a database"),
-        ("before", r"an earlier version of armcal \(journal/journal-00000001.log\). Go on with that version"),
     ):
         before = {path: path.read_bytes() for path in (tmp_path / name).rglob("*") if path.is_file()}
         for opened in (lambda name=name: Journal(tmp_path / name, {}), lambda name=name: KeptJournal(tmp_path / name)):

@@ -14,16 +14,16 @@ from typing import Any
 
 import pytest
 from armcal.errors import ArmcalError, InputError
-from armcal.io.json_server import MOST_CLIENTS, Answers, JsonServer
+from armcal.io.json_server import MOST_CLIENTS, JsonServer
 
 LONGEST = 256 * 1024
 
 
-class House(Answers):
+class House:
     """A server that echoes, turned by hand: ``long ...`` takes many slices, and nothing is answered while it waits."""
 
     def __init__(self) -> None:
-        self.server = JsonServer(self, LONGEST)
+        self.server = JsonServer(self.begin, self.refusal, LONGEST)
         self.answering = True
         self.size = 0
         self.lines: list[bytes] = []

@@ -17,14 +17,23 @@ from armcal.calibration.convert import difference, load_source, nominal_values
 from armcal.calibration.rigid_chain import numeric_chain, tool_poses
 from armcal.cli.main import cli
 from armcal.cli.new_robot import direction, place
-from armcal.config.yaml_nodes import word
+from armcal.config.yaml_source import word
 from armcal.errors import InputError
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from armcal.scaffold.plugin_files import number
-from armcal.scaffold.robot import RobotJoint, Row, read_rows, robot_of_rows, robot_of_urdf
-from armcal.scaffold.robot_files import RECORDS, SIMULATED, _levels, write_robot
+from armcal.scaffold.robot import (
+    RECORDS,
+    SIMULATED,
+    RobotJoint,
+    Row,
+    _levels,
+    read_rows,
+    robot_of_rows,
+    robot_of_urdf,
+    write_robot,
+)
 from click.testing import CliRunner, Result
 from scaffolds import ROOT, commands_of, files_of, page
 from scipy.spatial.transform import Rotation

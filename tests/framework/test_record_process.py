@@ -231,9 +231,9 @@ class GuidedStep:
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (("--from", "udp:99999"), "expected - (standard input), udp:PORT"),
-        (("--from", "udp:0.0.0.0:9000"), "expected - (standard input), udp:PORT of this machine"),
-        (("--from", "/no/such/file"), "no joint readings come"),
+        (("--from", "udp:99999"), "expected - (standard input) or udp:PORT"),
+        (("--from", "udp:0.0.0.0:9000"), "expected - (standard input) or udp:PORT of this machine"),
+        (("--from", "/no/such/file"), "expected - (standard input) or udp:PORT of this machine"),
         ((), "found no bench"),
         (("--from", "udp:0", "--set", "bench.joints={type: json_lines, joints: {j9: x}}"), "no joint is called 'j9'"),
         (("--from", "udp:0", "--set", "bench.recording.window_s=0"), "window is not above zero"),

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal.io.folder import reserved
+from armcal.io.plain_files import reserved
 from click.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[2]

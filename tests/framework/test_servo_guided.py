@@ -228,9 +228,3 @@ def test_an_entry_that_is_no_observation_is_refused_with_its_place(tmp_path):
         record.append("what", {})
     with pytest.raises(DataError, match=r"journal.sqlite: entry 2: .*delete from entry where sequence = 2"):
         Record(tmp_path)
-
-
-def test_observations_of_an_earlier_version_are_named(tmp_path):
-    (tmp_path / "observations.jsonl").write_text('{"kind": "begun"}\n')
-    with pytest.raises(InputError, match=r"a journal of an earlier version of armcal \(observations.jsonl\)"):
-        Record(tmp_path)

@@ -7,8 +7,7 @@ import os
 
 import pytest
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
-from armcal.devices.framed import messages
-from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
+from armcal.devices.framed import VERSION, Frame, FrameDecoder, Kind, encoded
 from armcal.devices.link import GuardedLink
 from armcal_pca9685.device import Pca9685Device
 from armcal_pca9685.framed_link import FramedLink
@@ -97,7 +96,7 @@ def test_an_old_greeting_that_comes_late_is_overcome(board):
     link.open(board.clock)
     with board.paused():
         late = (link._sequence + 150) % 256
-        board.firmware.receive(encoded(Frame(messages.Kind.HELLO, late, messages.Hello().pack())))
+        board.firmware.receive(encoded(Frame(Kind.HELLO, late, bytes((VERSION,)))))
     assert link.read(0x40, 0x00, 1) == b"\x11"
 
 
@@ -241,7 +240,7 @@ def test_more_waypoints_than_a_frame_holds_are_refused(board, tmp_path):
 
 def test_a_killed_hosts_half_frame_harms_nobody(board):
     other = os.open(board.path, os.O_RDWR | os.O_NOCTTY)
-    os.write(other, encoded(Frame(messages.Kind.WRITE, 9, b"\x40\0\0"))[:5])
+    os.write(other, encoded(Frame(Kind.WRITE, 9, b"\x40\0\0"))[:5])
     link = link_to(board)
     assert link.open(board.clock).boots == 1
     assert link.read(0x40, 0x00, 1) == b"\x11"

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import math
 import socket
-from pathlib import Path
 
 import pytest
 from armcal.errors import ConfigError, InputError
-from armcal_contact.json_joints import JsonLinesJoints, JsonLinesJointSettings
+from armcal_contact.json_joints import JointMessages, JsonLinesJoints, JsonLinesJointSettings, RefusedLine
 
 CHANNELS = ("arm.j1", "arm.j2")
 
@@ -27,17 +26,17 @@ class Stopped:
         raise AssertionError("a stream never waits")
 
 
-def opened(path: Path, channels=CHANNELS, **settings):
-    stream = JsonLinesJoints(JsonLinesJointSettings(source=str(path), **settings))
-    path.touch()
+def opened(channels=CHANNELS, **settings):
+    stream = JsonLinesJoints(JsonLinesJointSettings(source="udp:0", **settings))
     stream.open(Stopped(), channels)
     return stream
 
 
-def append(path: Path, *messages) -> None:
-    with path.open("a") as file:
+def send(stream: JsonLinesJoints, *messages) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for message in messages:
-            file.write((message if isinstance(message, str) else json.dumps(message)) + "\n")
+            text = message if isinstance(message, str) else json.dumps(message)
+            sender.sendto(text.encode(), stream.address)
 
 
 @pytest.mark.parametrize(
@@ -53,19 +52,19 @@ def append(path: Path, *messages) -> None:
         ({"joints": {"j1": "a", "j2": "b"}}, {"name": ["b", "a"], "position": [math.pi / 2, 0.25]}),
     ],
 )
-def test_forms_of_a_message(tmp_path, settings, message):
-    stream = opened(tmp_path / "q.jsonl", **settings)
-    append(tmp_path / "q.jsonl", message)
+def test_forms_of_a_message(settings, message):
+    stream = opened(**settings)
+    send(stream, message)
     (sample,) = stream.samples()
     assert sample.angles == pytest.approx({"arm.j1": 0.25, "arm.j2": math.pi / 2}, rel=1e-15)
     assert sample.arrived == 7.0 and sample.stamp is None and stream.samples() == []
 
 
-def test_times_and_labels(tmp_path):
-    stream = opened(tmp_path / "q.jsonl", time="at_ms", unit="rad")
-    append(tmp_path / "q.jsonl", {"j1": 1, "j2": 2, "at_ms": 1500, "socket": " hole_0 ", "n": 4, "empty": ""})
+def test_times_and_labels():
+    stream = opened(time="at_ms", unit="rad")
+    send(stream, {"j1": 1, "j2": 2, "at_ms": 1500, "socket": " hole_0 ", "n": 4, "empty": ""})
     ros = {"header": {"stamp": {"sec": 3, "nanosec": 500_000_000}}, "name": ["j1", "j2"], "position": [1, 2]}
-    append(tmp_path / "q.jsonl", ros)
+    send(stream, ros)
     first, second = stream.samples()
     assert (first.stamp, first.labels) == (1.5, {"socket": "hole_0"})
     assert (second.stamp, second.labels) == (3.5, {})
@@ -89,72 +88,47 @@ def test_times_and_labels(tmp_path):
         ({"name": ["j1", "j2"], "position": [1]}, "it has not as many positions as names"),
         ("[1, 2]", "it is no JSON object"),
         ("{", "it is not JSON"),
-        ("[" * 100_000, "it is too long"),
         ("[" * 10_000, "it is not JSON"),
         ("\xff\x00", "it is not JSON"),
     ],
 )
-def test_lines_that_say_nothing_of_use_are_counted_by_reason(tmp_path, message, why):
-    stream = opened(tmp_path / "q.jsonl")
-    append(tmp_path / "q.jsonl", message, {"j1_rad": 1, "j2_rad": 2})
+def test_lines_that_say_nothing_of_use_are_counted_by_reason(message, why):
+    stream = opened()
+    send(stream, message, {"j1_rad": 1, "j2_rad": 2})
     assert len(stream.samples()) == 1 and stream.refused == {why: 1}
 
 
-def test_a_list_of_another_length_is_refused_with_both_counts(tmp_path):
-    stream = opened(tmp_path / "q.jsonl", values="q")
-    append(tmp_path / "q.jsonl", {"q": [1, 2, 3]}, {"p": [1, 2]})
+def test_a_list_of_another_length_is_refused_with_both_counts():
+    stream = opened(values="q")
+    send(stream, {"q": [1, 2, 3]}, {"p": [1, 2]})
     assert stream.samples() == []
     assert stream.refused == {"it has 3 joints, expected 2": 1, "it has no list q": 1}
 
 
-def test_a_source_that_repeats_itself_is_not_live(tmp_path):
-    stream = opened(tmp_path / "q.jsonl", unit="rad")
-    append(tmp_path / "q.jsonl", *[{"j1": 1, "j2": 2, "time_s": t} for t in (1, 2, 2, 2, 1)])
+def test_a_source_that_repeats_itself_is_not_live():
+    stream = opened(unit="rad")
+    send(stream, *[{"j1": 1, "j2": 2, "time_s": t} for t in (1, 2, 2, 2, 1)])
     assert [sample.stamp for sample in stream.samples()] == [1, 2, 1]
     assert list(stream.refused.values()) == [2]
 
 
-def test_joints_of_two_arms_are_told_apart(tmp_path):
-    stream = opened(tmp_path / "q.jsonl", ("left.q1", "right.q1"))
-    append(tmp_path / "q.jsonl", {"left.q1_rad": 1, "right.q1_rad": 2}, {"q1_rad": 1})
+def test_joints_of_two_arms_are_told_apart():
+    stream = opened(("left.q1", "right.q1"))
+    send(stream, {"left.q1_rad": 1, "right.q1_rad": 2}, {"q1_rad": 1})
     (sample,) = stream.samples()
     assert sample.angles == {"left.q1": 1, "right.q1": 2} and "it has 0 joints" in next(iter(stream.refused))
 
 
 @pytest.mark.parametrize("joints", [{"j9": "x"}, {"j1": "x", "arm.j1": "y"}, {"j1": "x", "j2": "x"}])
-def test_names_that_fit_no_joint_are_refused_at_once(tmp_path, joints):
+def test_names_that_fit_no_joint_are_refused_at_once(joints):
     with pytest.raises(ConfigError):
-        opened(tmp_path / "q.jsonl", joints=joints)
+        opened(joints=joints)
 
 
-def test_a_file_is_followed_from_its_end_through_cuts_and_replacements(tmp_path):
-    path = tmp_path / "q.jsonl"
-    append(path, {"j1": 0, "j2": 0})
-    with path.open("a") as file:
-        file.write('{"j1": 1, ')
-    stream = opened(path, unit="rad")
-    assert stream.samples() == []
-    append(path, '"j2": 1}', {"j1": 2, "j2": 2})
-    assert [sample.angles["arm.j1"] for sample in stream.samples()] == [1, 2]
-    path.write_text("")
-    stream.samples()
-    append(path, {"j1": 3, "j2": 3})
-    assert [sample.angles["arm.j1"] for sample in stream.samples()] == [3]
-    other = tmp_path / "other"
-    append(other, {"j1": 4, "j2": 4})
-    other.rename(path)
-    assert [sample.angles["arm.j1"] for sample in stream.samples()] == [4]
-    path.unlink()
-    assert stream.samples() == [] and not stream.ended
-    again = opened(path, unit="rad", begin="start")
-    append(path, {"j1": 5, "j2": 5})
-    assert len(again.samples()) == 1
-
-
-def test_datagrams_and_a_port_that_is_taken(tmp_path):
+def test_datagrams_and_a_port_that_is_taken():
     stream = JsonLinesJoints(JsonLinesJointSettings(source="udp:0", unit="rad"))
     stream.open(Stopped(), CHANNELS)
-    port = stream._source.port
+    port = stream.address[1]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto(b'{"j1": 1, "j2": 2}\n{"j1": 3, "j2": 4}', ("127.0.0.1", port))
         sender.sendto(b"x" * 65_000, ("127.0.0.1", port))
@@ -166,8 +140,12 @@ def test_datagrams_and_a_port_that_is_taken(tmp_path):
     assert stream.samples() == [] and stream.ended
 
 
-@pytest.mark.parametrize("source", ["/no/such/file", "/", "/no\0"])
-def test_a_source_that_is_not_there_is_refused(source):
-    with pytest.raises((InputError, ValueError)) as caught:
-        JsonLinesJoints(JsonLinesJointSettings(source=source)).open(Stopped(), CHANNELS)
-    assert "cannot" in str(caught.value) or "read line by line" in str(caught.value) or "path" in str(caught.value)
+@pytest.mark.parametrize("source", ["/no/such/file", "/", "udp:x", "udp:70000"])
+def test_a_source_that_is_none_is_refused(source):
+    with pytest.raises(ValueError, match=r"expected - .standard input. or udp:PORT"):
+        JsonLinesJointSettings(source=source)
+
+
+def test_a_line_that_is_too_long_is_refused():
+    with pytest.raises(RefusedLine, match="it is too long"):
+        JointMessages(CHANNELS, {}, None, None, "time_s").read(None)

@@ -1,11 +1,10 @@
-"""Trackers that speak JSON: datagrams, files that grow, are cut and replaced, and what is refused."""
+"""Trackers that speak JSON: datagrams, and what is refused."""
 
 from __future__ import annotations
 
 import json
 import random
 import socket
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,17 +19,6 @@ from scipy.spatial.transform import Rotation
 def line(counter: int, **bodies: object) -> bytes:
     content = {"frame": counter, "t": 0.1 * counter, "bodies": bodies or {"tool": {"p_mm": [1, 2, 3]}}}
     return json.dumps(content).encode() + b"\n"
-
-
-def growing(path: Path, **settings: object) -> JsonLinesTracker:
-    tracker = JsonLinesTracker(JsonLinesSettings.model_validate({"path": path, **settings}))
-    tracker.open(RealClock())
-    return tracker
-
-
-def append(path: Path, *data: bytes) -> None:
-    with path.open("ab") as file:
-        file.writelines(data)
 
 
 def test_a_frame_of_json() -> None:
@@ -125,76 +113,9 @@ def test_datagrams_of_lines() -> None:
     assert tracker.frames() == []
 
 
-@pytest.mark.parametrize("settings", [{}, {"port": 5, "path": "/a"}, {"port": -1}, {"port": 5, "host": "x"}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"port": 5, "path": "/a"}, {"path": "/a"}, {"port": -1}, {"port": 5, "host": "x"}]
+)
 def test_bad_settings(settings: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         JsonLinesSettings.model_validate(settings)
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    made = tmp_path / "frames.jsonl"
-    made.touch()
-    return made
-
-
-def test_only_what_comes_after_opening_counts(path: Path) -> None:
-    append(path, line(1), line(2))
-    tracker = growing(path)
-    assert tracker.frames() == []
-    append(path, line(3))
-    [found] = tracker.frames()
-    assert found.counter == 3 and found.stamp == pytest.approx(0.3)
-    np.testing.assert_allclose(found.bodies["tool"][:3, 3], [0.001, 0.002, 0.003])  # type: ignore[index]
-
-
-def test_all_of_it_counts_where_that_is_asked_for(path: Path) -> None:
-    append(path, line(1), line(2))
-    assert [f.counter for f in growing(path, begin="start").frames()] == [1, 2]
-
-
-def test_a_torn_line_waits_for_its_end(path: Path) -> None:
-    begun = line(1)
-    append(path, begun[:8])
-    tracker = growing(path)
-    rest = begun[8:] + line(2)
-    found = []
-    for i in range(0, len(rest), 7):
-        append(path, rest[i : i + 7])
-        found += [f.counter for f in tracker.frames()]
-    assert found == [1, 2] and tracker.refused == {}
-
-
-def test_a_file_that_is_cut_or_replaced_is_read_from_its_start(path: Path) -> None:
-    tracker = growing(path)
-    for counter in (10, 11, 12, 13):
-        append(path, line(counter))
-    assert len(tracker.frames()) == 4
-    path.write_text("")
-    tracker.frames()
-    append(path, line(1))
-    assert [f.counter for f in tracker.frames() + tracker.frames()] == [1]
-    other = path.with_name("other")
-    other.write_bytes(line(1) + line(2))
-    other.replace(path)
-    assert [f.counter for f in tracker.frames() + tracker.frames()] == [1, 2]
-    path.unlink()
-    assert tracker.frames() == []
-    path.write_bytes(line(1))
-    assert [f.counter for f in tracker.frames() + tracker.frames()] == [1]
-
-
-def test_long_lines_and_noise_are_counted(path: Path) -> None:
-    tracker = growing(path)
-    append(path, b"x" * 200_000 + b"\n" + b"\xff\xfe,\n\n" + line(5))
-    assert [f.counter for f in tracker.frames()] == [5]
-    assert sum(tracker.refused.values()) == 2
-
-
-def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(DeviceRefusedError, match="gone"):
-        growing(tmp_path / "gone.jsonl")
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    with pytest.raises(DeviceRefusedError, match="not a regular file"):
-        growing(folder)

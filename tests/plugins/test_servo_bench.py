@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock
 from armcal.config.servo_file import load_servo_file
-from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
+from armcal.devices.framed import Frame, FrameDecoder, encoded
 from armcal.errors import ArmcalError
 from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment, clearance_check

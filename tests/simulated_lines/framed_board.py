@@ -5,26 +5,21 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from armcal.devices.framed.frames import MAX_PAYLOAD, Frame, FrameDecoder, encoded
-from armcal.devices.framed.messages import (
+from armcal.devices.framed import MAX_PAYLOAD, VERSION, Code, Flag, Frame, FrameDecoder, Kind, encoded
+
+from tests.simulated_lines.framed_messages import (
     LATE,
-    VERSION,
-    Code,
-    Flag,
     Guard,
     GuardedChannel,
     Head,
     Hello,
     HelloReply,
-    Kind,
     Read,
     Refusal,
     Set,
     Take,
     Write,
-    packed_head,
 )
-
 from tests.simulated_lines.pca9685_model import COUNTS, FULL, LED0, BusStuckError, I2cBus
 
 TICK_S = 0.02
@@ -215,7 +210,7 @@ class FramedBoard:
         flags = Flag.TOOK_OVER if self.guard.took_over else Flag(0)
         flags |= Flag.GUARDED if self.guard.is_set else Flag(0)
         flags |= Flag.STUCK if self._bus.stuck else Flag(0)
-        self._reply = encoded(Frame(kind, frame.sequence, packed_head(Head(self.boots, flags)) + content))
+        self._reply = encoded(Frame(kind, frame.sequence, Head(self.boots, flags).pack() + content))
         self._send(self._reply)
 
     def _done(self, kind: int, payload: bytes) -> bytes:

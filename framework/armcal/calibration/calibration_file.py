@@ -29,8 +29,7 @@ from armcal.base.settings import Settings
 from armcal.calibration.intervals import PlusMinus, PredictionRecord
 from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
-from armcal.config.yaml_nodes import needs_quotes
-from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.config.yaml_source import ConfigSource, load_config, needs_quotes
 from armcal.errors import ConfigError, Location, PluginError
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import DeterminedBy

@@ -45,8 +45,7 @@ from armcal.calibration.intervals import PlusMinus, beyond_records
 from armcal.calibration.rigid_chain import rigid_chain
 from armcal.cli.common import FILE, Console, accept, arm, point, spare_inputs, speaking, unwritten, within
 from armcal.config.validate import validate
-from armcal.config.yaml_nodes import Node, Origin, assignment, set_at
-from armcal.config.yaml_source import Reader, as_source
+from armcal.config.yaml_source import Node, Origin, Reader, as_source, assignment, set_at
 from armcal.errors import ArmcalError, ConfigError, InputError, Location, PluginError
 from armcal.io.plain_files import check_output, require_new, write_new, write_over, writing
 from armcal.measure.checks import noticed, records_of

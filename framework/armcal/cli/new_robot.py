@@ -16,6 +16,8 @@ from armcal.measure.tables import is_number
 from armcal.plugins import PluginRegistry
 from armcal.scaffold.robot import (
     MOST,
+    NOISE_ALONE_MM,
+    RESULTS,
     WIDTHS,
     Convention,
     Robot,
@@ -24,8 +26,9 @@ from armcal.scaffold.robot import (
     robot_name,
     robot_of_rows,
     robot_of_urdf,
+    try_out,
+    write_robot,
 )
-from armcal.scaffold.robot_files import NOISE_ALONE_MM, RESULTS, try_out, write_robot
 
 CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
 SKELETONS = {path.stem: path for path in sorted(Path(scaffold.__file__).with_name("skeletons").glob("*.csv"))}

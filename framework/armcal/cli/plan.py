@@ -18,8 +18,7 @@ from armcal.estimate.estimator import Progress
 from armcal.estimate.identifiability import Measure
 from armcal.estimate.simulation import TruthfulSimulator
 from armcal.estimate.start import carriers_of
-from armcal.io.folder import check_folder
-from armcal.io.plain_files import write_over
+from armcal.io.plain_files import check_folder, write_over
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.instrument import Rendering
 from armcal.measure.measurement import borrowed_names

@@ -9,8 +9,8 @@ from armcal.cli.common import FILE, Console, command_line, data, overrides, para
 from armcal.cli.console import say
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.estimate.estimator import CHECK_THE_DATA
-from armcal.io.folder import reserved
 from armcal.io.parallel import Executor
+from armcal.io.plain_files import reserved
 from armcal.report.numbers import plural
 from armcal.report.page import page
 from armcal.report.run_document import plugin_sections, run_document

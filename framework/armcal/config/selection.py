@@ -48,14 +48,10 @@ class ParameterSettings(Settings):
 
 
 def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSource) -> Parameters:
-    """Parameters as a configuration wants them.
-
-    Raises:
-        ConfigError: a glob matches nothing, a unit is wrong, a prior is not positive, a value is out of bounds.
-    """
     at: Path = ("parameters",)
-    for key, glob in [*_indexed("free", settings.free), *_indexed("fixed", settings.fixed)]:
-        _matching(parameters, glob, source, (*at, *key))
+    for key, globs in (("free", settings.free), ("fixed", settings.fixed)):
+        for index, glob in enumerate(globs):
+            _matching(parameters, glob, source, (*at, key, index))
     parameters = with_values(parameters, settings.values, source, (*at, "values"))
     if settings.bounds in ("none", False):
         parameters = parameters.without_bounds()
@@ -66,7 +62,26 @@ def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSo
             parameters = parameters.replaced({name: replace(parameters[name], prior_sd=deviation)})
     of_groups = {block.name for block in parameters.nuisances if block.free}
     free = (set(parameters.select(settings.free)) | of_groups) - set(parameters.select(settings.fixed))
-    return _with_drift(parameters.with_free(free), settings.drift, source, (*at, "drift"))
+    parameters = parameters.with_free(free)
+    for glob, stated in settings.drift.items():
+        place = (*at, "drift", glob)
+        for name in _matching(parameters, glob, source, place):
+            block = parameters[name]
+            if not block.free or block.size != 1:
+                why = f"{name} cannot drift: it is {'a matrix' if block.size != 1 else 'not free'}."
+                hint = "Let free numbers drift: add it to parameters.free, under a prior if need be."
+                source.refuse(place, why, hint)
+            deviation = _deviation(block, stated.sd, source, (*place, "sd"))
+            where = source.where((*place, "over"))
+            try:
+                over = parse_quantity(stated.over, "time") if isinstance(stated.over, str) else float(stated.over)
+            except ValueError as fault:
+                raise ConfigError(f"{fault}", where=where, hint="Write records (10) or a time (20 min).") from fault
+            if not over > 0 or not math.isfinite(over):
+                raise ConfigError(f"found {stated.over}, expected a distance above zero.", where=where)
+            drift = Drift(deviation, over, "time" if isinstance(stated.over, str) else "sequence")
+            parameters = parameters.replaced({name: replace(block, drift=drift)})
+    return parameters
 
 
 def without_groups(settings: ParameterSettings, instances: Collection[str]) -> ParameterSettings:
@@ -81,39 +96,11 @@ def without_groups(settings: ParameterSettings, instances: Collection[str]) -> P
     )
 
 
-def _with_drift(
-    parameters: Parameters, drifting: Mapping[str, DriftSettings], source: ConfigSource, at: Path
-) -> Parameters:
-    for glob, stated in drifting.items():
-        for name in _matching(parameters, glob, source, (*at, glob)):
-            block = parameters[name]
-            if not block.free or block.size != 1:
-                source.refuse(
-                    (*at, glob),
-                    f"{name} cannot drift: it is {'a matrix' if block.size != 1 else 'not free'}.",
-                    "Let free numbers drift: add it to parameters.free, under a prior if need be.",
-                )
-            deviation = _deviation(block, stated.sd, source, (*at, glob, "sd"))
-            timed, where = isinstance(stated.over, str), source.where((*at, glob, "over"))
-            try:
-                over = parse_quantity(stated.over, "time") if isinstance(stated.over, str) else float(stated.over)
-            except ValueError as fault:
-                raise ConfigError(f"{fault}", where=where, hint="Write records (10) or a time (20 min).") from fault
-            if not over > 0 or not math.isfinite(over):
-                raise ConfigError(f"found {stated.over}, expected a distance above zero.", where=where)
-            drift = Drift(deviation, over, "time" if timed else "sequence")
-            parameters = parameters.replaced({name: replace(block, drift=drift)})
-    return parameters
-
-
 def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, at: Path) -> float:
     deviation = quantity(block, text, source, at)
     if not deviation > 0 or not math.isfinite(deviation):
-        source.refuse(
-            at,
-            f"found {text}, expected a standard deviation above zero.",
-            "Give how far from the nominal value the parameter may well be.",
-        )
+        hint = "Give how far from the nominal value the parameter may well be."
+        source.refuse(at, f"found {text}, expected a standard deviation above zero.", hint)
     return deviation
 
 
@@ -124,21 +111,15 @@ def with_values(
     changed: dict[str, Path] = {}
     for name, text in values.items():
         place = (*at, name)
+        where = source.where(place) if source else None
         owner = name.partition("[")[0]
         if owner not in parameters.names:
-            listed = ", ".join(_matching(parameters, name, source, place))
-            raise ConfigError(
-                f"{name} stands for several names: a value is of one parameter.",
-                where=source.where(place) if source else None,
-                hint=f"Give each its own: {listed}.",
-            )
+            hint = f"Give each its own: {', '.join(_matching(parameters, name, source, place))}."
+            raise ConfigError(f"{name} stands for several names: a value is of one parameter.", where=where, hint=hint)
         block = parameters[owner]
         if name not in block.entry_names:
-            raise ConfigError(
-                f"{name} is no single number.",
-                where=source.where(place) if source else None,
-                hint=f"Give its entries, each on its own: {', '.join(block.entry_names)}.",
-            )
+            hint = f"Give its entries, each on its own: {', '.join(block.entry_names)}."
+            raise ConfigError(f"{name} is no single number.", where=where, hint=hint)
         numbers = list(block.nominal)
         i = block.entry_names.index(name)
         is_plain = not isinstance(text, str) and DIMENSION_OF_UNIT.get(block.unit) in (None, DIMENSIONLESS)
@@ -161,19 +142,12 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
             raise ConfigError(f"found {text!r}, expected a plain number for {block.name}.", where=where)
         return float(text)
     if not isinstance(text, str):
-        raise ConfigError(
-            f"found {text} without a unit for {block.name}.",
-            where=where,
-            hint=f"Write its unit as well, such as {text} {display_unit(dimension).name} or {text} {block.unit}.",
-        )
+        hint = f"Write its unit as well, such as {text} {display_unit(dimension).name} or {text} {block.unit}."
+        raise ConfigError(f"found {text} without a unit for {block.name}.", where=where, hint=hint)
     try:
         return parse_quantity(text, dimension)
     except ValueError as fault:
         raise ConfigError(f"{block.name}: {fault}", where=where) from fault
-
-
-def _indexed(key: str, globs: tuple[str, ...]) -> list[tuple[Path, str]]:
-    return [((key, index), glob) for index, glob in enumerate(globs)]
 
 
 def _matching(parameters: Parameters, glob: str, source: ConfigSource | None, at: Path) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ One file is read by what drives the boards and by what calibrates the arm, so th
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
@@ -17,8 +17,7 @@ from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.settings import Settings, UnitOf
 from armcal.base.units import from_unit, to_unit
 from armcal.config.validate import validate
-from armcal.config.yaml_nodes import word
-from armcal.config.yaml_source import load_config
+from armcal.config.yaml_source import load_config, word
 from armcal.errors import ConfigError
 
 ALL_CALL = 0x70
@@ -33,15 +32,10 @@ Place = tuple[str | int, ...]
 
 
 def usable_address(address: int) -> int:
-    """The address itself.
-
-    Raises:
-        ValueError: no board can have it.
-    """
+    """The address itself, or a ValueError where no board can have it."""
     if not ADDRESSES[0] <= address <= ADDRESSES[1] or address == ALL_CALL:
-        raise ValueError(
-            f"found the address 0x{address:02x}, expected 0x40 to 0x77 and not 0x70, to which all boards listen"
-        )
+        text = f"found the address 0x{address:02x}, expected 0x40 to 0x77"
+        raise ValueError(f"{text} and not 0x70, to which all boards listen")
     return address
 
 
@@ -140,11 +134,7 @@ class ServoFileError(ValueError):
 
 @dataclass(frozen=True)
 class ServoFile:
-    """Boards by name and servos by joint.
-
-    Raises:
-        ServoFileError: a board is not there, two parts are in the same place, or a pulse is too long.
-    """
+    """Boards by name and servos by joint, that fit each other."""
 
     boards: Mapping[str, BoardSettings]
     servos: Mapping[str, ServoSettings]
@@ -166,14 +156,19 @@ class ServoFile:
             if first != joint:
                 text = f"found channel {servo.channel}, which {first!r} has, expected its own"
                 raise ServoFileError(text, ("servos", joint, "channel"))
+            clock, (low, high) = self.boards[servo.board].clock, servo.pulse_range
             try:
-                _check_pulses(servo, self.boards[servo.board].clock)
-                check_longest(servo.table, self.boards[servo.board].clock)
+                if high - low < 2 * clock.tick:
+                    text = f"found a pulse_range of {1e6 * (high - low):g} us, expected more than two counts of the"
+                    raise ValueError(f"{text} board, {2e6 * clock.tick:.1f} us")
+                if outside := [pulse for pulse in servo.pulses if not low <= pulse <= high]:
+                    text = f"found a pulse of {1e6 * outside[0]:.1f} us, expected {1e6 * low:g} to {1e6 * high:g} us"
+                    raise ValueError(f"{text}, the pulse_range of the servo")
+                check_longest(servo.table, clock)
             except ValueError as fault:
                 raise ServoFileError(str(fault), ("servos", joint, "pulses")) from fault
 
     def calibrated(self, joint: str) -> CalibratedServo:
-        """All of a servo that a calibration hangs on."""
         servo = self.servos[joint]
         board = self.boards[servo.board]
         return CalibratedServo.si(
@@ -188,11 +183,6 @@ class ServoFile:
 
 
 def load_servo_file(path: str | Path) -> ServoFile:
-    """Read and check a servo file.
-
-    Raises:
-        ConfigError: with file, line and field.
-    """
     source = load_config(path)
     settings = validate(ServoFileSettings, source)
     try:
@@ -204,48 +194,28 @@ def load_servo_file(path: str | Path) -> ServoFile:
 
 def servo_file_text(file: ServoFile) -> str:
     lines = ["boards:"]
-    lines += [f"  {word(name)}: {{{_listed(board_fields(board))}}}" for name, board in file.boards.items()]
+    for name, board in file.boards.items():
+        fields = [("address", f"0x{board.address:02x}"), ("oscillator_hz", _number(board.oscillator_hz))]
+        fields += [("rate_hz", _number(board.rate_hz)), ("id", json.dumps(board.id, ensure_ascii=False))]
+        lines.append(_entry(name, fields))
     lines.append("servos:")
-    lines += [f"  {word(joint)}: {{{_listed(servo_fields(servo))}}}" for joint, servo in file.servos.items()]
+    for joint, servo in file.servos.items():
+        fields = [("board", word(servo.board)), ("channel", str(servo.channel))]
+        fields += [_in_unit("angles", servo.angles, "deg", "rad"), _in_unit("pulses", servo.pulses, "us", "s")]
+        if "pulse_range" in servo.model_fields_set:
+            fields.append(_in_unit("pulse_range", servo.pulse_range, "us", "s"))
+        lines.append(_entry(joint, fields))
     return "\n".join(lines) + "\n"
 
 
-def board_fields(board: BoardSettings) -> list[tuple[str, str]]:
-    clock = [("oscillator_hz", _number(board.oscillator_hz)), ("rate_hz", _number(board.rate_hz))]
-    return [("address", f"0x{board.address:02x}"), *clock, ("id", json.dumps(board.id, ensure_ascii=False))]
-
-
-def servo_fields(servo: ServoSettings) -> list[tuple[str, str]]:
-    angles = _in_unit("angles", servo.angles, "deg", "rad")
-    pulses = _in_unit("pulses", servo.pulses, "us", "s")
-    allowed = _in_unit("pulse_range", servo.pulse_range, "us", "s")
-    stated = [allowed] if "pulse_range" in servo.model_fields_set else []
-    return [("board", word(servo.board)), ("channel", str(servo.channel)), angles, pulses, *stated]
-
-
-def _listed(fields: list[tuple[str, str]]) -> str:
-    return ", ".join(f"{key}: {text}" for key, text in fields)
+def _entry(name: str, fields: Iterable[tuple[str, str]]) -> str:
+    return f"  {word(name)}: {{{', '.join(f'{key}: {text}' for key, text in fields)}}}"
 
 
 def digest(servos: Mapping[str, CalibratedServo]) -> str:
     """A fingerprint (hex) of all that a calibration hangs on; another number anywhere gives another one."""
     parts = {joint: servo.to_config() for joint, servo in servos.items()}
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def _check_pulses(servo: ServoSettings, clock: PulseClock) -> None:
-    low, high = servo.pulse_range
-    if high - low < 2 * clock.tick:
-        raise ValueError(
-            f"found a pulse_range of {1e6 * (high - low):g} us, expected more than two counts of the board, "
-            f"{2e6 * clock.tick:.1f} us"
-        )
-    outside = [pulse for pulse in servo.pulses if not low <= pulse <= high]
-    if outside:
-        raise ValueError(
-            f"found a pulse of {1e6 * outside[0]:.1f} us, expected {1e6 * low:g} to {1e6 * high:g} us, the "
-            "pulse_range of the servo"
-        )
 
 
 def check_longest(table: PulseTable, clock: PulseClock) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pkgutil import resolve_name
 from typing import Any, Literal, TypeVar
 
@@ -91,23 +92,17 @@ class SystemSettings(Settings):
     statics: StaticsSettings = Field(default_factory=StaticsSettings)
 
 
+# A centre of mass is no farther from its frame: in lengths of the arm from joint to joint, and beyond (m).
 _FARTHEST_LENGTHS, _FARTHEST_M = 1.5, 0.5
-"""A centre of mass is no farther from its frame: in lengths of the arm from joint to joint, and beyond (m)."""
 ASSUMED_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2, on the earth with z up, where it is not stated. [Williams2024]
 
 
 @dataclass(frozen=True)
 class System:
-    """What is calibrated and measured.
-
-    Attributes:
-        description: arms, measurements and statics as a configuration in SI units, complete and self-contained.
-    """
-
     arms: Mapping[str, Arm]  # by instance name
     measurements: Mapping[str, Measurement]  # by instance name
     statics: StaticsSettings  # as stated
-    description: Mapping[str, Any]
+    description: Mapping[str, Any]  # of all three as a configuration in SI units, complete and self-contained
 
     @property
     def environment(self) -> Environment:
@@ -126,12 +121,6 @@ class System:
 
 
 def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
-    """Build arms and measurements.
-
-    Raises:
-        ConfigError: anything in ``arms``, ``measurements`` or ``statics`` is refused, with file, line and field.
-        PluginError: a type is not known, or its plugin is broken.
-    """
     parts = replace(source, data={k: source.data[k] for k in SystemSettings.model_fields if k in source.data})
     settings = validate(SystemSettings, parts)
     _instance_names(source, [*settings.arms, *settings.measurements])
@@ -143,21 +132,31 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     for name in settings.measurements:
         at: Path = ("measurements", name)
         measurements[name], described[name] = build_component(source, registry, "measurement", at, tuple(arms))
-        _check_channels(measurements[name])
         carried = measurements[name]
+        channels = carried.channels()
+        with expecting(carried.channels, channels, "a sequence of Channel(name, dimension)"):
+            for channel in channels:
+                if channel.dimension not in DIMENSIONS:
+                    expected = f"Channel(name, dimension), of {', '.join(DIMENSIONS)}"
+                    refuse(carried.channels, f"{channel!r}", expected)
         if isinstance(carried, Carried):
             carrier = arms[measurements[name].arms[0]]
             moved = [frame for frame, joint in frame_names(carrier.nominal_chain).items() if joint]
             for setting, frame in carried.carriers.items():
                 if frame not in moved:
-                    source.refuse(
-                        (*at, setting),
-                        f"no frame that a joint of {carrier.name} moves is called {frame!r}.",
-                        f"Such frames are {', '.join(moved)}.",
-                    )
+                    text = f"no frame that a joint of {carrier.name} moves is called {frame!r}."
+                    source.refuse((*at, setting), text, f"Such frames are {', '.join(moved)}.")
     for name, measurement in measurements.items():
         if isinstance(measurement, Borrowing) and measurement.lender is not None:
-            _check_lender(source, ("measurements", name), measurement, measurements)
+            place, lender = ("measurements", name), measurements.get(measurement.lender)
+            if lender is None or measurement.lender == name:
+                text = f"found {measurement.lender!r}, whose parameters are to be used, expected another measurement."
+                others = ", ".join(other for other in measurements if other != name)
+                source.refuse(place, text, f"The others are {others or 'none'}.")
+            if isinstance(lender, Borrowing) and lender.lender is not None:
+                text = f"{measurement.lender} has the parameters of {lender.lender} itself."
+                source.refuse(place, text, f"Name {lender.lender}.")
+            _refusable(source, place, partial(measurement.check_lender, lender))
     description = {"arms": described_arms, "measurements": described, "statics": settings.statics.to_config()}
     return System(arms, measurements, settings.statics, description)
 
@@ -165,12 +164,7 @@ def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
 def build_component(
     source: ConfigSource, registry: PluginRegistry, kind: str, at: Path, *context: Any
 ) -> tuple[Any, dict[str, Any]]:
-    """The component named by ``type`` in the section at a path, and the section in SI units.
-
-    Raises:
-        ConfigError: no ``type``, or settings or component refused.
-        PluginError: the type is not known, or its plugin is broken.
-    """
+    """The component named by ``type`` in the section at a path, and the section in SI units."""
     section: Any = source.data
     for step in at:
         section = section[step]
@@ -201,21 +195,11 @@ def build_component(
     return built, {"type": name, **settings.to_config()}
 
 
-def _check_channels(measurement: Measurement) -> None:
-    channels = measurement.channels()
-    with expecting(measurement.channels, channels, "a sequence of Channel(name, dimension)"):
-        for channel in channels:
-            if channel.dimension not in DIMENSIONS:
-                refuse(measurement.channels, f"{channel!r}", f"Channel(name, dimension), of {', '.join(DIMENSIONS)}")
-
-
 def _broken(component: Component, fault: str) -> PluginError:
     file = plugin_files().get(component.plugin)
-    return BrokenPluginError(
-        f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}.",
-        where=Location(str(file)) if file else None,
-        hint=f"See armcal plugins check {component.plugin}.",
-    )
+    text = f"the {component.kind} {component.name!r} of the plugin {component.plugin!r} is broken: {fault}."
+    hint = f"See armcal plugins check {component.plugin}."
+    return BrokenPluginError(text, where=Location(str(file)) if file else None, hint=hint)
 
 
 def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm, dict[str, Any]]:
@@ -261,24 +245,19 @@ def _arm(source: ConfigSource, registry: PluginRegistry, name: str) -> tuple[Arm
     return arm, described
 
 
-def _check_lender(source: ConfigSource, at: Path, borrower: Borrowing, measurements: Mapping[str, Measurement]) -> None:
-    """Refuse a lender that is not there, that borrows itself, or whose parameters mean something else."""
-    lender, others = measurements.get(str(borrower.lender)), [name for name in measurements if name != at[-1]]
-    if lender is None or borrower.lender == at[-1]:
-        source.refuse(
-            at,
-            f"found {borrower.lender!r}, whose parameters are to be used, expected another measurement.",
-            f"The others are {', '.join(others) or 'none'}.",
-        )
-    if isinstance(lender, Borrowing) and lender.lender is not None:
-        source.refuse(at, f"{borrower.lender} has the parameters of {lender.lender} itself.", f"Name {lender.lender}.")
-    _refusable(source, at, lambda: borrower.check_lender(lender))
-
-
 def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettings], arm: Arm) -> None:
     """Refuse links that cannot be, and centres of mass farther out than any of such an arm."""
-    for link, stated in links.items():
-        _check_link(source, (*at, link), stated, frame_names(arm.nominal_chain), len(arm.joint_names))
+    known, joints = frame_names(arm.nominal_chain), len(arm.joint_names)
+    for name, link in links.items():
+        place = (*at, name)
+        if link.frame not in known:
+            text = f"no frame is called {link.frame!r}."
+            source.refuse((*place, "frame"), text, f"The frames are {', '.join(known)}.")
+        if link.mass < 0:
+            source.refuse((*place, "mass"), "found a mass below zero.", "Give the mass.")
+        if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
+            text = f"found joint {link.loads_up_to_joint}, expected 0 to {joints}."
+            source.refuse((*place, "loads_up_to_joint"), text, "Joints count from 1; 0 is the mount.")
     for mass in arm.masses:
         away, farthest = math.hypot(*mass.com), _FARTHEST_LENGTHS * arm.length + _FARTHEST_M
         if away > farthest:
@@ -288,19 +267,6 @@ def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettin
             source.refuse(place, text, "Are these millimetres? Write com_mm, or correct the URDF's inertial.")
 
 
-def _check_link(source: ConfigSource, at: Path, link: LinkSettings, known: Mapping[str, int], joints: int) -> None:
-    if link.frame not in known:
-        source.refuse((*at, "frame"), f"no frame is called {link.frame!r}.", f"The frames are {', '.join(known)}.")
-    if link.mass < 0:
-        source.refuse((*at, "mass"), "found a mass below zero.", "Give the mass.")
-    if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
-        source.refuse(
-            (*at, "loads_up_to_joint"),
-            f"found joint {link.loads_up_to_joint}, expected 0 to {joints}.",
-            "Joints count from 1; 0 is the mount.",
-        )
-
-
 def _instance_names(source: ConfigSource, names: list[str]) -> None:
     """Names head parameter names and columns, so they must not collide or hold a dot or a glob."""
     for name in names:
@@ -308,19 +274,12 @@ def _instance_names(source: ConfigSource, names: list[str]) -> None:
         if names.count(name) > 1 or name == STATICS:
             source.refuse(section, f"{name!r} names two things.", "Rename one.")
         if not name.isidentifier():
-            source.refuse(
-                section,
-                f"{name!r} is no instance name.",
-                "Use letters, digits and underscores, beginning with a letter.",
-            )
+            hint = "Use letters, digits and underscores, beginning with a letter."
+            source.refuse(section, f"{name!r} is no instance name.", hint)
 
 
 def _part_names(source: ConfigSource, at: Path, kind: str, names: Collection[str], taken: Collection[str] = ()) -> None:
-    """Names below an arm are parts of parameter names, which patterns match and where dots and brackets mean something.
-
-    Raises:
-        ConfigError: a name cannot be such a part, stands twice, or is taken.
-    """
+    """Names below an arm are parts of parameter names, which patterns match; dots and brackets have a meaning there."""
     for name in names:
         where = source.where((*at, name))
         if not FIT_NAME.fullmatch(name) or not name.isprintable():

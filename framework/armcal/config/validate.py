@@ -3,80 +3,64 @@
 import difflib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from armcal.base.settings import Fault, Settings
-from armcal.config.yaml_nodes import Step, dotted
-from armcal.config.yaml_source import ConfigSource, find_key
+from armcal.config.yaml_source import ConfigSource, Step, dotted, find_key
 from armcal.errors import ConfigError
 
 S = TypeVar("S", bound=Settings)
 
 _MOST_LISTED = 50
-_NUMBER_MEND = "write it without quotes, with a decimal point"
-
-# What pydantic expected, and how to mend it, by its error type.
-_EXPECTED: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "float_type": ("a number", _NUMBER_MEND),
-        "int_type": ("a whole number", "write it without quotes and without a decimal point"),
-        "bool_type": ("true or false", "write one of them without quotes"),
-        "string_type": ("text", "put it in double quotes"),
-        "list_type": ("a list", "write [a, b] or one '- ' line each"),
-        "tuple_type": ("a list", "write [a, b] or one '- ' line each"),
-        "set_type": ("a list", "write [a, b] or one '- ' line each"),
-        "dict_type": ("keys and values", "write indented 'key: value' lines"),
-        "mapping_type": ("keys and values", "write indented 'key: value' lines"),
-        "model_type": ("keys and values", "write indented 'key: value' lines"),
-        "model_attributes_type": ("keys and values", "write indented 'key: value' lines"),
-        "none_required": ("nothing", "leave the key out"),
-        "path_type": ("the path of a file", "write it as text"),
-    }
-)
+_LIST = ("a list", "write [a, b] or one '- ' line each")
+_KEYS = ("keys and values", "write indented 'key: value' lines")
+# What pydantic expected, and what to do, by its error type.
+_EXPECTED: Mapping[str, tuple[str, str]] = {
+    "float_type": ("a number", "write it without quotes, with a decimal point"),
+    "int_type": ("a whole number", "write it without quotes and without a decimal point"),
+    "bool_type": ("true or false", "write one of them without quotes"),
+    "string_type": ("text", "put it in double quotes"),
+    "none_required": ("nothing", "leave the key out"),
+    "path_type": ("the path of a file", "write it as text"),
+    **dict.fromkeys(("list_type", "tuple_type", "set_type"), _LIST),
+    **dict.fromkeys(("dict_type", "mapping_type", "model_type", "model_attributes_type"), _KEYS),
+}
 
 
 @dataclass(frozen=True)
 class _Finding:
-    """One of pydantic's errors, placed in the config.
-
-    ``branches`` are the union members it was found under, each with the path of the union's value.
-    """
+    """One of pydantic's errors, placed in the config."""
 
     path: tuple[Step, ...]
-    branches: tuple[tuple[tuple[Step, ...], str], ...]
+    branches: tuple[tuple[tuple[Step, ...], str], ...]  # the union members it is under, each with the union's path
     kind: str
     value: str
     expected: str
     mend: str
-    message: str = ""
+    message: str  # in place of these three
 
     @property
     def text(self) -> str:
-        if self.message:
-            return self.message
         end = "" if self.mend.endswith("?") else "."
-        return f"found {self.value}, expected {self.expected}: {self.mend}{end}"
+        return self.message or f"found {self.value}, expected {self.expected}: {self.mend}{end}"
 
 
 def validate(
     settings_class: type[S], source: ConfigSource, at: tuple[Step, ...] = (), beside: Collection[str] = ()
 ) -> S:
-    """Check the part of a configuration below a path.
+    """Check the part of a configuration below a path, but for keys ``beside`` that are another's.
 
-    Args:
-        settings_class: the settings it must make.
-        source: the configuration.
-        at: the path of the part; ``()`` is the whole.
-        beside: keys of the part that are another's.
-
-    Raises:
-        ConfigError: lists every fault with its file, line and field, what was found, what was expected and
-            the mend; its ``where`` is that of the first.
+    A ConfigError lists every fault with its file, line and field, what was found, what was expected and what to do.
     """
-    raw = _part(settings_class, source, at)
+    raw: Any = source.data
+    for step in at:
+        if (key := find_key(raw, step)) is None:
+            keys = ", ".join(settings_class.keys())
+            hint = f"Write '{at[-1]}:' with some of {keys}."
+            source.refuse(at, f"found no {dotted(at)!r}, expected keys and values.", hint)
+        raw = raw[key]
     if beside and isinstance(raw, dict):
         raw = {key: value for key, value in raw.items() if key not in beside}
     try:
@@ -92,20 +76,6 @@ def validate(
         if others:
             lines.append(f"Correct these {len(placed)} places.")
         raise ConfigError("\n".join(lines), where=first[0]) from fault
-
-
-def _part(settings_class: type[Settings], source: ConfigSource, at: tuple[Step, ...]) -> Any:
-    value: Any = source.data
-    for step in at:
-        key = find_key(value, step)
-        if key is None:
-            source.refuse(
-                at,
-                f"found no {dotted(at)!r}, expected keys and values.",
-                f"Write '{at[-1]}:' with some of {', '.join(settings_class.keys())}.",
-            )
-        value = value[key]
-    return value
 
 
 def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
@@ -127,43 +97,34 @@ def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
             path.append(step)
         else:
             branches.append((tuple(path), str(step)))
-    made = _Finding(tuple(path), tuple(branches), kind, _shown(value, refused), "", "")
+    shown, expected, mend, message = _shown(value, refused), "", "", ""
+    text, context = str(error["msg"]), error.get("ctx", {})
     if isinstance(refused, Fault):
-        return replace(made, message=refused.message)
-    if kind != "missing":
-        return _explained(made, error)
-    if isinstance(loc[-1], int) and isinstance(value, list):
+        message = refused.message
+    elif kind == "missing" and isinstance(loc[-1], int) and isinstance(value, list):
+        path.pop()
         message = f"found a list of {len(value)} values, expected at least {loc[-1] + 1}: add the missing ones."
-        return replace(made, path=made.path[:-1], message=message)
-    return replace(made, message=f"found nothing, expected the key {loc[-1]!r}: write '{loc[-1]}: ...'.")
-
-
-def _explained(made: _Finding, error: Mapping[str, Any]) -> _Finding:
-    context = error.get("ctx", {})
-    message = str(error["msg"])
-    if made.kind in _EXPECTED:
-        expected, mend = _EXPECTED[made.kind]
-        return replace(made, expected=expected, mend=mend)
-    if made.kind in ("value_error", "assertion_error"):
-        return replace(made, message=message.split(", ", 1)[1])
-    if made.kind in ("literal_error", "enum"):
+    elif kind in ("missing", "union_tag_not_found"):
+        key = str(loc[-1] if kind == "missing" else context.get("discriminator")).strip("'")
+        message = f"found nothing, expected the key {key!r}: write '{key}: ...'."
+    elif kind in _EXPECTED:
+        expected, mend = _EXPECTED[kind]
+    elif kind in ("value_error", "assertion_error"):
+        message = text.split(", ", 1)[1]
+    elif kind in ("literal_error", "enum"):
         expected = str(context.get("expected"))
-        mend = _nearest(error["input"], expected.replace(" or ", ", "))
-        return replace(made, expected=expected, mend=mend)
-    if made.kind == "union_tag_invalid":
-        tags = str(context.get("expected_tags"))
-        text = f"the {context.get('discriminator')} {context.get('tag')!r}"
-        mend = _nearest(context.get("tag"), tags)
-        return replace(made, value=text, expected=f"one of {tags}", mend=mend)
-    if made.kind == "union_tag_not_found":
-        key = str(context.get("discriminator")).strip("'")
-        return replace(made, message=f"found nothing, expected the key {key!r}: write '{key}: ...'.")
-    if made.kind in ("too_short", "too_long"):
+        mend = _nearest(refused, expected.replace(" or ", ", "))
+    elif kind == "union_tag_invalid":
+        tags, tag = str(context.get("expected_tags")), context.get("tag")
+        shown, expected, mend = f"the {context.get('discriminator')} {tag!r}", f"one of {tags}", _nearest(tag, tags)
+    elif kind in ("too_short", "too_long"):
         least = context.get("min_length")
         expected = f"at most {context.get('max_length')}" if least is None else f"at least {least}"
-        return replace(made, expected=expected, mend="remove the rest" if least is None else "add what is missing")
-    expected = message.removeprefix("Input should be ")
-    return replace(made, expected=expected[:1].lower() + expected[1:], mend="correct it")
+        mend = "remove the rest" if least is None else "add what is missing"
+    else:
+        expected = text.removeprefix("Input should be ")
+        expected, mend = expected[:1].lower() + expected[1:], "correct it"
+    return _Finding(tuple(path), tuple(branches), kind, shown, expected, mend, message)
 
 
 def _nearest(value: Any, choices: str) -> str:

@@ -3,8 +3,6 @@
 import time
 from typing import Protocol
 
-from typing_extensions import override
-
 
 class Clock(Protocol):
     """Seconds; every wait of a bench goes through ``sleep``, so that a simulated bench can make time pass."""
@@ -20,17 +18,12 @@ class Clock(Protocol):
 
 
 class RealClock(Clock):
-    """The machine's own."""
-
-    @override
     def now(self) -> float:
         return time.monotonic()
 
-    @override
     def wall(self) -> float:
         return time.time()
 
-    @override
     def sleep(self, seconds: float) -> None:
         if seconds > 0:
             time.sleep(seconds)

@@ -32,32 +32,20 @@ class DeviceRefusedError(InputError):
 
 @dataclass(frozen=True)
 class DeviceIdentity:
-    """Which device a dataset was measured with.
+    """Which device a dataset was measured with."""
 
-    Attributes:
-        name: for people, one line.
-        digest: of everything that a calibration hangs on (board identity, oscillator, prescale, pulse tables), hex.
-        boots: how often it has started, where it counts that.
-        adapter: what tells its adapter from all others, as ``LinkIdentity`` has it; empty if nothing does.
-    """
-
-    name: str
-    digest: str
-    boots: int | None = None
-    adapter: str = ""
+    name: str  # for people, one line
+    digest: str  # of all that a calibration hangs on (board identity, oscillator, prescale, pulse tables), hex
+    boots: int | None = None  # how often it has started, where it counts that
+    adapter: str = ""  # what tells its adapter from all others, as ``LinkIdentity`` has it; empty if nothing does
 
 
 @dataclass(frozen=True)
 class DeviceState:
-    """What a device is doing, read from it and not remembered.
+    """What a device is doing, read from it and not remembered."""
 
-    Attributes:
-        angles: by joint, of those that get pulses: the angle its pulse asks for (rad). The others hang free.
-        took_over: the device has driven by itself, since its host was silent.
-    """
-
-    angles: Mapping[str, float]
-    took_over: bool = False
+    angles: Mapping[str, float]  # of joints that get pulses: what the pulse asks for (rad); the others hang free
+    took_over: bool = False  # it has driven by itself, since its host was silent
 
 
 class JointDevice(Protocol):
@@ -137,7 +125,6 @@ class MeasuringDevice(Protocol):
 
 
 def open_device(device: JointDevice, clock: Clock) -> DeviceIdentity:
-    """The device, opened; see ``JointDevice.open`` for what it raises."""
     identity = device.open(clock)
     with expecting(device.open, identity, "a DeviceIdentity of texts"):
         _ = identity.name + identity.digest + identity.adapter
@@ -152,7 +139,6 @@ def state_of(device: JointDevice) -> DeviceState:
 
 
 def standing_at(device: JointDevice, angles: Mapping[str, float]) -> dict[str, float]:
-    """The angles that pulses can set nearest to these (rad)."""
     standing = device.standing(angles)
     _check_angles(device.standing, standing, angles, whole=True)
     return standing

@@ -9,17 +9,11 @@ from armcal.devices.clock import Clock
 
 @dataclass(frozen=True)
 class LinkIdentity:
-    """Who is at the other end.
+    """Who is at the other end."""
 
-    Attributes:
-        adapter: what tells this adapter from all others (a USB serial number, a board id); empty if nothing does.
-        firmware: what it runs, in words.
-        boots: how often it has started, where it counts that; None where it does not.
-    """
-
-    adapter: str
-    firmware: str = ""
-    boots: int | None = None
+    adapter: str  # what tells it from all others (a USB serial number, a board id); empty if nothing does
+    firmware: str = ""  # what it runs, in words
+    boots: int | None = None  # how often it has started, where it counts that
 
 
 class Link(Protocol):
@@ -46,8 +40,7 @@ class Link(Protocol):
         """Let go of it; nothing is said to the devices. May be called twice."""
 
 
-Counts = Mapping[tuple[int, int], int]
-"""Pulse lengths in counts by device address and channel."""
+Counts = Mapping[tuple[int, int], int]  # pulse lengths by device address and channel
 
 
 @runtime_checkable

@@ -15,19 +15,12 @@ from armcal.plugins import expecting, refuse
 
 @dataclass(frozen=True)
 class JointSample:
-    """One reading of all joints.
+    """One reading of all joints."""
 
-    Attributes:
-        arrived: when it came, by the bench's clock (s).
-        stamp: when it was taken, by the source's own clock (s), where it says so.
-        angles: by channel (``arm.q1``; rad, or m of sliding joints).
-        labels: text that came with it (a socket's name).
-    """
-
-    arrived: float
-    stamp: float | None
-    angles: Mapping[str, float]
-    labels: Mapping[str, str] = field(default_factory=dict)
+    arrived: float  # when it came, by the bench's clock (s)
+    stamp: float | None  # when it was taken, by the source's own clock (s), where it says so
+    angles: Mapping[str, float]  # by channel (``arm.q1``; rad, or m of sliding joints)
+    labels: Mapping[str, str] = field(default_factory=dict)  # text that came with it (a socket's name)
 
 
 class JointStream(Protocol):
@@ -56,26 +49,17 @@ class JointStream(Protocol):
         """Stop. May be called twice."""
 
 
-REPEATED = "a repeated frame number"
-"""The reason in ``Tracker.refused`` for frames that came before, by their number."""
+REPEATED = "a repeated frame number"  # in ``Tracker.refused``, for frames that came before
 
 
 @dataclass(frozen=True)
 class TrackerFrame:
-    """One moment, as a tracker saw it.
+    """One moment as a tracker saw it: ``world_T_body`` of bodies; its rotation is NaN where only a place is known."""
 
-    Attributes:
-        counter: the tracker's frame number; rises by one from frame to frame, more where frames were lost.
-        arrived: when it came, by the bench's clock (``Clock.now``, s).
-        stamp: when it was taken, by the tracker's own clock (s), where it says so.
-        bodies: ``world_T_body`` (4 x 4, m) by the tracker's own name of the body; None: not seen in this frame. The
-            rotation is NaN where only a position is known.
-    """
-
-    counter: int
-    arrived: float
-    stamp: float | None
-    bodies: Mapping[str, Array | None] = field(default_factory=dict)
+    counter: int  # the tracker's frame number; rises by one from frame to frame, more where frames were lost
+    arrived: float  # when it came, by the bench's clock (``Clock.now``, s)
+    stamp: float | None  # when it was taken, by the tracker's own clock (s), where it says so
+    bodies: Mapping[str, Array | None] = field(default_factory=dict)  # 4 x 4 (m) by its own name; None: not seen
 
 
 class Tracker(Protocol):
@@ -104,21 +88,13 @@ class Tracker(Protocol):
 
 @dataclass(frozen=True)
 class Shot:
-    """One image and what it says.
+    """One image and what it says."""
 
-    Attributes:
-        content: of the image file that is to be kept.
-        suffix: of its name, ``.png``.
-        seen: what it shows, for people; without a full stop.
-        values: what was read, by channel (``camera.u_3``, SI); what was not seen is left out.
-        fault: why it says nothing, a sentence; empty if it does.
-    """
-
-    content: bytes
-    suffix: str
-    seen: str
-    values: Mapping[str, float] = field(default_factory=dict)
-    fault: str = ""
+    content: bytes  # of the image file that is to be kept
+    suffix: str  # of its name, ``.png``
+    seen: str  # what it shows, for people; without a full stop
+    values: Mapping[str, float] = field(default_factory=dict)  # what was seen, by channel (``camera.u_3``, SI)
+    fault: str = ""  # why it says nothing, a sentence; empty if it does
 
 
 class LiveCamera(Protocol):
@@ -156,7 +132,6 @@ class LiveCamera(Protocol):
 
 
 def frames_of(tracker: Tracker) -> list[TrackerFrame]:
-    """All frames that came since the last call."""
     frames = tracker.frames()
     with expecting(tracker.frames, frames, "a list of TrackerFrame(counter, arrived, stamp, bodies)"):
         frames = list(frames)
@@ -170,7 +145,6 @@ def frames_of(tracker: Tracker) -> list[TrackerFrame]:
 
 
 def samples_of(stream: JointStream) -> list[JointSample]:
-    """All joint readings that came since the last call."""
     samples, expected = stream.samples(), "a list of JointSample(arrived, stamp, angles, labels), of numbers and texts"
     with expecting(stream.samples, samples, expected):
         samples = list(samples)
@@ -181,7 +155,6 @@ def samples_of(stream: JointStream) -> list[JointSample]:
 
 
 def refused_by(source: Tracker | JointStream) -> Mapping[str, int]:
-    """How much a live source has passed over, by reason."""
     refused, own = source.refused, getattr(type(source), "refused", None)
     method = own if isinstance(own, property) else type(source)
     with expecting(method, refused, "refused as a mapping from reasons, texts, to counts"):
@@ -190,7 +163,6 @@ def refused_by(source: Tracker | JointStream) -> Mapping[str, int]:
 
 
 def shots_of(camera: LiveCamera) -> list[Shot]:
-    """All images that came by themselves since the last call."""
     return [_checked(camera.shots, shot) for shot in camera.shots()]
 
 

@@ -56,15 +56,17 @@ class SerialPort:
             DeviceLostError: it was open before, and is not there now.
         """
         import serial
+        from serial.tools import list_ports
 
         self.close()
-        path, serial_number = str(self._settings.port), self._adapter()
+        path, actual = str(self._settings.port), os.path.realpath(self._settings.port)
+        adapters = [p.serial_number or "" for p in list_ports.comports() if os.path.realpath(p.device) == actual]
         try:
             self._port = serial.Serial(path, self._settings.baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, termios.error) as fault:  # pyserial's own errors are OSErrors
             self._refuse(path, fault)
         self._was_open = True
-        return serial_number
+        return adapters[0] if adapters else ""
 
     def read(self, longest_s: float) -> bytes:
         """What has come, as soon as something has; empty if nothing does in this time (the machine's, not the bench's).
@@ -72,8 +74,7 @@ class SerialPort:
         Zero seconds gives what is there and does not wait.
         """
         try:
-            ready, _, _ = select.select([self._handle()], [], [], longest_s)
-            if not ready:
+            if not select.select([self._handle()], [], [], longest_s)[0]:
                 return b""
             data = os.read(self._handle(), _AT_ONCE)
         except BlockingIOError:
@@ -111,18 +112,8 @@ class SerialPort:
 
     def _lose(self, why: object) -> NoReturn:
         self.close()
-        raise DeviceLostError(
-            f"the serial port is gone ({why}).",
-            where=Location(str(self._settings.port)),
-            hint="Look at its plug, cable and power.",
-        )
-
-    def _adapter(self) -> str:
-        """The serial number of the port's USB adapter; empty if it has none."""
-        from serial.tools import list_ports
-
-        actual = os.path.realpath(self._settings.port)
-        return next((p.serial_number or "" for p in list_ports.comports() if os.path.realpath(p.device) == actual), "")
+        text, hint = f"the serial port is gone ({why}).", "Look at its plug, cable and power."
+        raise DeviceLostError(text, where=Location(str(self._settings.port)), hint=hint)
 
     def _refuse(self, path: str, fault: Exception) -> NoReturn:
         number = fault.errno if isinstance(fault, OSError) else None
@@ -133,10 +124,7 @@ class SerialPort:
         elif number == errno.ENOENT:
             message, hint = "there is no such serial port.", "Plug the board in; python -m serial.tools.list_ports."
         elif number in (errno.EACCES, errno.EPERM):
-            message, hint = (
-                "this serial port may not be opened.",
-                "Join its group (dialout) and log in anew.",
-            )
+            message, hint = "this serial port may not be opened.", "Join its group (dialout) and log in anew."
         else:
             message, hint = f"this serial port cannot be opened ({fault}).", "Check that the path is a serial port."
         raise DeviceRefusedError(message, where=Location(path), hint=hint) from fault

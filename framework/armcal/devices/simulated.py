@@ -15,28 +15,18 @@ ACCOUNT, LOG = "truth.json", "safety.jsonl"
 
 @dataclass(frozen=True)
 class BenchRequest:
-    """What a simulated bench works on.
+    """What a simulated bench works on."""
 
-    Attributes:
-        experiment: its arm, measurements, nominal parameters, clearance (``plan.clearance``) and limits.
-        folder: for account and log. Where an account is there, the bench goes on from it.
-        tool, base: what the session calls the bodies on the tool and at the arm's base.
-    """
-
-    experiment: Experiment
-    folder: Path
-    tool: str
-    base: str
+    experiment: Experiment  # its arm, measurements, nominal parameters, clearance (``plan.clearance``) and limits
+    folder: Path  # for account and log; where an account is there, the bench goes on from it
+    tool: str  # what the session calls the body on the tool
+    base: str  # and the one at the arm's base
 
 
 class RunningBench(Protocol):
-    """A simulated bench while a session uses it. Time passes only while its clock sleeps.
+    """A simulated bench while a session uses it. Time passes only while its clock sleeps."""
 
-    Attributes:
-        clock: the session's.
-    """
-
-    clock: Clock
+    clock: Clock  # the session's
 
     def device(self, configured: JointDevice, is_guarded: bool) -> JointDevice:
         """What is opened in the place of the configured device, which is asked only for joints and settable angles.

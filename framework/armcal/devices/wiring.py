@@ -20,8 +20,7 @@ from armcal.devices.device import JointDevice, MeasuringDevice
 from armcal.errors import InputError, Location
 from armcal.io.plain_files import write_whole, writing
 
-_WRONG = ""
-"""In the place of the fingerprint of a servo that did not do what was commanded."""
+_WRONG = ""  # in the place of the fingerprint of a servo that did not do what was commanded
 
 
 @dataclass(frozen=True)
@@ -45,22 +44,17 @@ class WiringRecord:
         parts = {key.rpartition(".")[2]: part for key, part in stated.items()} if isinstance(stated, dict) else {}
         is_real = _section(source).get("simulated") is None
         names = [joint.rpartition(".")[2] for joint in joints]
-        return cls(source.path, {name: _fingerprint([parts.get(name, device), is_real]) for name in names})
+        texts = {n: json.dumps(plain([parts.get(n, device), is_real]), sort_keys=True, default=str) for n in names}
+        return cls(source.path, {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()})
 
     @property
     def path(self) -> Path:
         return self.stated_in.with_name(f"{self.stated_in.name}.checked")
 
     def note(self, right: Iterable[str], others: Iterable[str], seen: Mapping[str, Any]) -> None:
-        """Write down which joints were seen to turn as commanded, and which were not.
+        """Write down which joints were seen to turn as commanded, and which did not or cannot be told from another one.
 
-        Args:
-            right: the joints seen to turn.
-            others: joints that were tried and did not, or cannot be distinguished from another one.
-            seen: ``adapter``, ``by`` (``tracker``) and ``at`` (unix s).
-
-        Raises:
-            InputError: it cannot be written.
+        ``seen`` has ``adapter``, ``by`` (``tracker``) and ``at`` (unix s). An InputError where it cannot be written.
         """
         wrong = {self._key(joint): {"servo": _WRONG, **seen} for joint in others}
         good = {key: {"servo": self.digests[key], **seen} for key in map(self._key, right)}
@@ -80,11 +74,7 @@ class WiringRecord:
             self._write({joint: entry for joint, entry in entries.items() if joint not in gone})
 
     def check(self, joints: Iterable[str], adapter: str = "") -> None:
-        """Whether all joints were seen to turn, on this adapter (empty: not known).
-
-        Raises:
-            InputError: one was not, or what is stated of it or the adapter is another one since.
-        """
+        """Raise InputError unless all joints were seen to turn, as now stated, on this adapter (empty: not known)."""
         entries, unchecked = self._entries(), dict[str, list[str]]()
         for joint in joints:
             if why := self._state(entries, self._key(joint), adapter):
@@ -129,11 +119,7 @@ class WiringRecord:
 
 
 def wiring_of(source: ConfigSource, device: JointDevice) -> WiringRecord | None:
-    """The record that a bench's device needs; None where its servos cannot be checked.
-
-    Raises:
-        ConfigError: its servo file is refused.
-    """
+    """The record that a bench's device needs; None where its servos cannot be checked."""
     if (servos := servo_file_of(source)) is not None:
         return WiringRecord.of_servo_file(servos)
     return WiringRecord.of_config(source, device.joint_names) if isinstance(device, MeasuringDevice) else None
@@ -151,7 +137,3 @@ def _section(source: ConfigSource, *parts: str) -> dict[str, Any]:
     for part in ("bench", *parts):
         section = section.get(part) if isinstance(section, dict) else None
     return section if isinstance(section, dict) else {}
-
-
-def _fingerprint(stated: Any) -> str:
-    return hashlib.sha256(json.dumps(plain(stated), sort_keys=True, default=str).encode()).hexdigest()

@@ -6,7 +6,6 @@ log, ``synchronous=FULL``); others read meanwhile, by this module or any SQLite.
 """
 
 import json
-import os
 import resource
 import sqlite3
 from collections.abc import Iterator, Mapping
@@ -22,9 +21,7 @@ from armcal.errors import ArmcalError, DataError, InputError, Location
 from armcal.io.plain_files import make_folder
 
 JOURNAL = "journal.sqlite"
-_EARLIER = "journal"  # the folder of segments that versions before had in its place
-_EARLIER_LINES = "observations.jsonl"  # and what those of armcal servo had
-JOURNAL_FILES = (JOURNAL, *(f"{JOURNAL}{end}" for end in ("-wal", "-shm", "-journal", ".lock")), _EARLIER)
+JOURNAL_FILES = (JOURNAL, *(f"{JOURNAL}{end}" for end in ("-wal", "-shm", "-journal", ".lock")))
 """All that a journal may have in its folder."""
 TOTAL_BYTES = 64 << 20
 _ID, _FORMAT = 0x61726D63, 2
@@ -34,10 +31,10 @@ _TABLES = f"""
 BEGIN;
 PRAGMA application_id = {_ID};
 PRAGMA user_version = {_FORMAT};
-CREATE TABLE header (content TEXT NOT NULL, process INTEGER NOT NULL);
+CREATE TABLE header (content TEXT NOT NULL);
 CREATE TABLE entry (sequence INTEGER PRIMARY KEY, kind TEXT NOT NULL, content TEXT NOT NULL);
 CREATE TABLE checkpoint (sequence INTEGER PRIMARY KEY, state TEXT NOT NULL);
-INSERT INTO header VALUES ('{{}}', 0);
+INSERT INTO header VALUES ('{{}}');
 COMMIT;
 """
 
@@ -60,12 +57,7 @@ class Entry:
 
 
 class KeptJournal:
-    """A journal that is read, by any process and also while it is written; nothing in it is changed.
-
-    Raises:
-        DataError: there is none, it is damaged, of another program, or of another version.
-        InputError: it cannot be read.
-    """
+    """A journal that is read, by any process and also while it is written; nothing in it is changed."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -96,7 +88,6 @@ class KeptJournal:
 
     @property
     def checkpoint(self) -> Entry | None:
-        """The newest one."""
         return self._checkpoint_at(self.sequence)
 
     def entries(self, after: int = 0, until: int | None = None) -> Iterator[Entry]:
@@ -108,19 +99,13 @@ class KeptJournal:
                 yield Entry(sequence, kind, self._parsed(content, f"entry {sequence}"))
 
     def until(self, sequence: int) -> tuple[Entry, tuple[Entry, ...]]:
-        """The last checkpoint at or before an entry, and the entries after it up to and with that one.
-
-        Raises:
-            InputError: the journal no longer reaches back to it, or does not yet reach to it.
-        """
+        """The last checkpoint at or before an entry, and the entries after it up to and with that one."""
         last, first = self.sequence, self._row("SELECT coalesce(min(sequence), 0) FROM entry")[0]
         checkpoint = self._checkpoint_at(sequence)
         if checkpoint is None or not max(first, 1) <= sequence <= last:
-            raise InputError(
-                f"found no entry {sequence}; the journal goes from {first} to {last}.",
-                where=Location(str(self.path)),
-                hint="Give the sequence number of an entry that is kept.",
-            )
+            text = f"found no entry {sequence}; the journal goes from {first} to {last}."
+            hint = "Give the sequence number of an entry that is kept."
+            raise InputError(text, where=Location(str(self.path)), hint=hint)
         return checkpoint, tuple(self.entries(checkpoint.sequence, sequence))
 
     def verify(self) -> None:
@@ -184,39 +169,40 @@ class KeptJournal:
 
 
 class Journal(KeptJournal):
-    """The only writer of a journal, which is begun or gone on with. Not for several threads.
+    """The only writer of a journal, which is begun (with a ``header``) or gone on with. Not for several threads.
 
-    Args:
-        folder: its folder, made if it is not there.
-        header: what a new one is begun with.
-        total_bytes: how large it may grow: the oldest entries go then, as far as a checkpoint stands in for them.
-
-    Raises:
-        InputError: another process writes it, or the folder cannot be written.
-        DataError: it is damaged, of another program, or of another version.
-        JournalFullError: there is no room to begin one.
-
-    Attributes:
-        is_new: whether it held nothing when it was opened.
+    ``total_bytes`` is how large it may grow: the oldest entries go then, as far as a checkpoint stands in for them.
     """
 
     def __init__(self, folder: str | Path, header: Mapping[str, Any], total_bytes: int = TOTAL_BYTES) -> None:
         self.folder, self._total, self._failure = Path(folder), total_bytes, ""
         self.path = self.folder / JOURNAL
-        has_journal(self.folder)
         self._lock = FileLock(f"{self.path}.lock", timeout=0)
         try:
             make_folder(self.folder)
             self._lock.acquire()
         except Timeout as fault:
-            raise self._in_use() from fault
+            text = "another process writes this journal already."
+            hint = "End that process (see fuser), or give another folder; a journal can be read meanwhile."
+            raise InputError(text, where=Location(str(self.path)), hint=hint) from fault
         except OSError as fault:
             hint = "Give a writable folder on a disk that works."
             text = f"the journal cannot be written ({fault})."
             raise InputError(text, where=Location(str(self.folder)), hint=hint) from fault
         try:
             self._open("rwc")
-            self._begin(_text(header))
+            text = _text(header)
+            if not self._is_empty:
+                self.verify()
+            with self._writing():
+                self._database.execute("PRAGMA journal_mode = WAL").fetchone()
+                self._database.execute("PRAGMA synchronous = FULL")
+                if self._is_empty:
+                    self._database.executescript(_TABLES)
+                there = "SELECT (SELECT count(*) FROM entry) + (SELECT count(*) FROM checkpoint)"
+                self.is_new = not self._row(there)[0]  # whether it held nothing
+                if self.is_new:
+                    self._database.execute("UPDATE header SET content = ?", (text,))
         except BaseException:
             self._leave()
             raise
@@ -224,10 +210,8 @@ class Journal(KeptJournal):
     def record(self, kind: str, content: Any) -> int:
         """Write an entry and return its sequence number once it would outlast a power loss.
 
-        Raises:
-            ValueError, TypeError: the content is not JSON, or not finite; nothing was written.
-            JournalFullError: there is no room.
-            JournalFailedError: the disk fails.
+        Nothing is written where there is no room (``JournalFullError``) or where the content is not JSON, or not finite
+        (ValueError, TypeError). After a ``JournalFailedError`` nothing is written any more.
         """
         values = kind, _text(content)
         with self._writing():
@@ -246,7 +230,7 @@ class Journal(KeptJournal):
         text = _text(state)
         with self._writing():
             self._database.execute("INSERT OR REPLACE INTO checkpoint VALUES (?, ?)", (self.sequence, text))
-            while self._used() > self._total:
+            while _PAGE * (self._row("PRAGMA page_count")[0] - self._row("PRAGMA freelist_count")[0]) > self._total:
                 kept = self._row("SELECT sequence FROM checkpoint ORDER BY sequence LIMIT 1 OFFSET 1")
                 if kept is None:
                     break
@@ -269,32 +253,6 @@ class Journal(KeptJournal):
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 
-    def _begin(self, header: str) -> None:
-        if not self._is_empty:
-            self.verify()
-        with self._writing():
-            self._database.execute("PRAGMA journal_mode = WAL").fetchone()
-            self._database.execute("PRAGMA synchronous = FULL")
-            if self._is_empty:
-                self._database.executescript(_TABLES)
-            self.is_new = not self._row("SELECT (SELECT count(*) FROM entry) + (SELECT count(*) FROM checkpoint)")[0]
-            self._database.execute("UPDATE header SET process = ?", (os.getpid(),))
-            if self.is_new:
-                self._database.execute("UPDATE header SET content = ?", (header,))
-
-    def _in_use(self) -> InputError:
-        number = "of a number not yet known"
-        with suppress(ArmcalError), KeptJournal(self.folder) as kept:
-            number = kept._row("SELECT process FROM header")[0]
-        return InputError(
-            f"process {number} writes this journal already.",
-            where=Location(str(self.path)),
-            hint="End that process, or give another folder; a journal can be read meanwhile.",
-        )
-
-    def _used(self) -> int:
-        return _PAGE * int(self._row("PRAGMA page_count")[0] - self._row("PRAGMA freelist_count")[0])
-
     @contextmanager
     def _writing(self) -> Iterator[None]:
         if not self._failure:
@@ -306,17 +264,13 @@ class Journal(KeptJournal):
                     with suppress(sqlite3.Error):
                         self._database.rollback()
                 if fault.sqlite_errorcode == sqlite3.SQLITE_FULL or self._is_at_limit():
-                    raise JournalFullError(
-                        f"there is no room for an entry ({fault}); it was not written.",
-                        where=Location(str(self.path)),
-                        hint="Make room on the disk, then start again; what was acknowledged is kept.",
-                    ) from fault
+                    text = f"there is no room for an entry ({fault}); it was not written."
+                    hint = "Make room on the disk, then start again; what was acknowledged is kept."
+                    raise JournalFullError(text, where=Location(str(self.path)), hint=hint) from fault
                 self._failure = str(fault)
-        raise JournalFailedError(
-            f"the journal takes no more entries ({self._failure}). All that was acknowledged before is kept.",
-            where=Location(str(self.path)),
-            hint="Look at the disk and its quota, and for a program that holds the file locked; then start again.",
-        )
+        text = f"the journal takes no more entries ({self._failure}). All that was acknowledged before is kept."
+        hint = "Look at the disk and its quota, and for a program that holds the file locked; then start again."
+        raise JournalFailedError(text, where=Location(str(self.path)), hint=hint)
 
     def _is_at_limit(self) -> bool:
         """Whether a file is as large as this process may make one."""
@@ -326,20 +280,10 @@ class Journal(KeptJournal):
 
 
 def has_journal(folder: Path) -> bool:
-    """Whether a folder holds a journal.
-
-    Raises:
-        InputError: it holds one that was written by an earlier version, which this one does not read.
-    """
-    with suppress(OSError):
-        if (folder / JOURNAL).is_file():
-            return True
-        earlier = *sorted((folder / _EARLIER).glob("journal-*.log")), *folder.glob(_EARLIER_LINES)
-        if earlier:
-            hint = "Go on with that version, or give a new --out (of a recalibration, begun from its calibration.yaml)."
-            text = f"it holds a journal of an earlier version of armcal ({earlier[0].relative_to(folder)})."
-            raise InputError(text, where=Location(str(folder)), hint=hint)
-    return False
+    try:
+        return (folder / JOURNAL).is_file()
+    except OSError:
+        return False
 
 
 def _text(content: Any) -> str:

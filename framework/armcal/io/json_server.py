@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from stat import S_ISSOCK
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 from armcal.base.config_text import as_line
 from armcal.errors import ArmcalError, DataError, InputError, Location
@@ -27,6 +27,8 @@ MOST_CLIENTS = 64
 SLICE_S = 0.001  # After so much work the server looks who else has come
 _GRACE_S = 0.5  # So long the last answers may take to be written
 _PATH_BYTES = 100  # A longer path does not fit a Unix socket's address
+
+_Answer = queue.SimpleQueue[bytes | None]  # to one request of a client; None where nobody will answer it
 
 
 @contextmanager
@@ -45,10 +47,7 @@ def short_address(path: Path) -> Iterator[str]:
 def vacate(path: Path, taken: str, hint: str) -> None:
     """Take away a socket that nobody serves any more.
 
-    ``taken`` is the sentence for one that somebody serves, ``hint`` says which option to change.
-
-    Raises:
-        InputError: somebody serves it, or something else is there.
+    ``taken`` is what an InputError says of one that somebody serves, ``hint`` which option to change.
     """
     where = Location(str(path))
     try:
@@ -68,11 +67,7 @@ def vacate(path: Path, taken: str, hint: str) -> None:
 
 
 class JsonClient(contextlib.ExitStack):
-    """A connection to a server, for requests one after another.
-
-    Raises:
-        OSError: nobody answers at the path.
-    """
+    """A connection to a server, for requests one after another. OSError: nobody answers, or not in time."""
 
     def __init__(self, path: Path, timeout_s: float = 30.0) -> None:
         super().__init__()
@@ -87,11 +82,6 @@ class JsonClient(contextlib.ExitStack):
         self._answers = self.enter_context(self._connection.makefile("rb"))
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The answer.
-
-        Raises:
-            OSError: the server went away, or takes too long (TimeoutError).
-        """
         self._connection.sendall(json.dumps(request).encode() + b"\n")
         line = self._answers.readline()
         if not line:
@@ -99,63 +89,26 @@ class JsonClient(contextlib.ExitStack):
         return dict(json.loads(line))
 
 
-class Answers(Protocol):
-    """What a server answers; nothing here may raise."""
-
-    def begin(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
-        """The answer to a line that came then (monotonic seconds); None before it, after each slice of work."""
-
-    def refusal(self, fault: ArmcalError) -> bytes:
-        """The answer to what cannot be read, and to a client that is one too many."""
-
-
-class PlainAnswers(Answers):
-    """Objects for objects, at once: by a function, whose exceptions become ``ok`` false and an ``error``."""
-
-    def __init__(self, answer: Callable[[dict[str, Any]], Mapping[str, Any]]) -> None:
-        self._answer = answer
-
-    def begin(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
-        try:
-            request = json.loads(line.decode("utf-8"))
-        except (ValueError, RecursionError) as fault:
-            yield self.refusal(DataError(f"the request is not JSON ({fault})."))
-            return
-        try:
-            if not isinstance(request, dict):
-                raise DataError("the request is JSON, but no object.")
-            yield as_line(self._answer(request)).encode()
-        except (ArmcalError, ValueError) as fault:
-            yield self.refusal(fault)
-        except Exception as fault:  # no request may end the server
-            yield self.refusal(ArmcalError(f"it failed ({type(fault).__name__}: {fault})."))
-
-    def refusal(self, fault: Exception) -> bytes:
-        return as_line({"ok": False, "error": str(fault)}).encode()
-
-
-class _Request:
-    """A line, the slices of its answer, and the answer once it is there; None where nobody will answer it."""
-
-    def __init__(self, line: bytes | None, arrived: float) -> None:
-        self.line, self.arrived = line, arrived  # no line: it was too long
-        self.work: Iterator[bytes | None] = iter(())
-        self.answer: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-
-
 class JsonServer:
     """Serves clients: only while ``serve`` is called is anyone answered.
 
-    Attributes:
-        requests: so far.
+    Args:
+        answering: makes the answer to a line that came then (monotonic seconds), after None for each slice of work
+            before it; nothing in it may raise.
+        refusal: makes the answer to what cannot be read, and to a client that is one too many.
+        longest: bytes that a request may have.
     """
 
-    def __init__(self, answers: Answers, longest: int = 64 * 1024) -> None:
-        """A request of more than ``longest`` bytes is refused."""
-        self.requests = 0
-        self._answers, self._longest, self._stopped = answers, longest, False
-        self._asked: queue.SimpleQueue[_Request | None] = queue.SimpleQueue()  # None: somebody left
-        self._begun: list[_Request] = []
+    def __init__(
+        self,
+        answering: Callable[[bytes, float], Iterator[bytes | None]],
+        refusal: Callable[[ArmcalError], bytes],
+        longest: int = 64 * 1024,
+    ) -> None:
+        self.requests = 0  # so far
+        self._answering, self._refusal, self._longest, self._stopped = answering, refusal, longest, False
+        self._asked: queue.SimpleQueue[tuple[bytes, float, _Answer]] = queue.SimpleQueue()
+        self._begun: list[tuple[Iterator[bytes | None], _Answer]] = []
         self._clients: dict[threading.Thread, socket.socket | None] = {}
         self._waiting: set[threading.Thread] = set()  # for an answer, or for somebody to take it
         self._listener: socket.socket | None = None
@@ -166,8 +119,27 @@ class JsonServer:
     def at(
         cls, path: Path, taken: str, hint: str, answer: Callable[[dict[str, Any]], Mapping[str, Any]]
     ) -> "JsonServer":
-        """A server of plain answers at a socket; see ``listen``."""
-        server = cls(PlainAnswers(answer))
+        """A server of objects at a socket (see ``listen``); what ``answer`` raises becomes an ``error``."""
+
+        def refusal(fault: Exception) -> bytes:
+            return as_line({"ok": False, "error": str(fault)}).encode()
+
+        def answering(line: bytes, arrived: float) -> Iterator[bytes]:
+            try:
+                request = json.loads(line.decode("utf-8"))
+            except (ValueError, RecursionError) as fault:
+                yield refusal(DataError(f"the request is not JSON ({fault})."))
+                return
+            try:
+                if not isinstance(request, dict):
+                    raise DataError("the request is JSON, but no object.")
+                yield as_line(answer(request)).encode()
+            except (ArmcalError, ValueError) as fault:
+                yield refusal(fault)
+            except Exception as fault:  # no request may end the server
+                yield refusal(ArmcalError(f"it failed ({type(fault).__name__}: {fault})."))
+
+        server = cls(answering, refusal)
         server.listen(path, taken, hint)
         return server
 
@@ -186,11 +158,7 @@ class JsonServer:
         return not self._waiting and not any([*self._clients.values()])
 
     def listen(self, path: Path, taken: str, hint: str) -> None:
-        """Serve a socket; one that nobody serves any more is replaced. ``taken`` and ``hint`` are as of ``vacate``.
-
-        Raises:
-            InputError: somebody serves it, something else is there, or it cannot be made.
-        """
+        """Serve a socket; one that nobody serves any more is replaced. ``taken`` and ``hint`` are as of ``vacate``."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             with short_address(path) as address:
@@ -224,12 +192,11 @@ class JsonServer:
         while self._begun and time.monotonic() < ends:
             # A slice for each of them, and first for those that were not begun: most are done with one.
             requests, self._begun = self._begun, []
-            for request in requests:
-                answer = next(request.work)
-                if answer is None:
-                    self._begun.append(request)
+            for work, answer in requests:
+                if (line := next(work)) is None:
+                    self._begun.append((work, answer))
                 else:
-                    request.answer.put(answer)
+                    answer.put(line)
             self._take(0.0)
 
     def stop_reading(self) -> None:
@@ -247,16 +214,15 @@ class JsonServer:
             self._accepting.join()
             self.stop_reading()  # of who came meanwhile
         ends = time.monotonic() + _GRACE_S
-        for client, connection in [*self._clients.items()]:
-            while connection is not None and client.is_alive():
-                self._take(0.0)
-                for request in self._begun:
-                    request.answer.put(None)
-                self._begun.clear()
-                if time.monotonic() > ends:
-                    with contextlib.suppress(OSError):
-                        connection.shutdown(socket.SHUT_RDWR)
-                client.join(SLICE_S)
+        connected = [(client, connection) for client, connection in [*self._clients.items()] if connection is not None]
+        while any(client.is_alive() for client, _ in connected):
+            self._take(SLICE_S)
+            for _, answer in self._begun:
+                answer.put(None)
+            self._begun.clear()
+            for _, connection in connected if time.monotonic() > ends else ():
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
         if self._listener is not None:
             self._listener.close()
             with contextlib.suppress(OSError):
@@ -276,7 +242,7 @@ class JsonServer:
                 continue
             fault = ArmcalError(f"{MOST_CLIENTS} clients are connected.", hint="Close connections that are not used.")
             with connection, contextlib.suppress(OSError):
-                connection.send(self._answers.refusal(fault) + b"\n")
+                connection.send(self._refusal(fault) + b"\n")
 
     def _begin(self, reader: BinaryIO, writer: BinaryIO, connection: socket.socket | None = None) -> None:
         client = threading.Thread(target=self._converse, args=[reader, writer, connection], daemon=True)
@@ -285,17 +251,25 @@ class JsonServer:
 
     def _converse(self, reader: BinaryIO, writer: BinaryIO, connection: socket.socket | None) -> None:
         """A client's thread: read its lines, have each answered, and write the answers."""
-        client = threading.current_thread()
+        client, answer = threading.current_thread(), _Answer()
         with contextlib.suppress(OSError):  # it is gone
-            for line in self._lines(reader):
+            while piece := reader.readline(self._longest + 1):
+                is_too_long = False
+                while len(piece) > self._longest and not piece.endswith(b"\n"):
+                    piece, is_too_long = reader.readline(self._longest + 1), True
+                if not (is_too_long or piece.strip()):
+                    continue
                 if self._stopped and connection is None:  # another's end is at what was sent before
                     break
-                request = _Request(line, time.monotonic())
                 self._waiting.add(client)
-                self._asked.put(request)
-                if (answer := request.answer.get()) is None:
+                if is_too_long:
+                    text = f"the request has more than {self._longest // 1024} KiB."
+                    answer.put(self._refusal(DataError(text, hint="Ask for less at a time.")))
+                else:
+                    self._asked.put((piece.strip(), time.monotonic(), answer))
+                if (line := answer.get()) is None:
                     break
-                writer.write(answer + b"\n")
+                writer.write(line + b"\n")
                 writer.flush()
                 self._waiting.discard(client)
         if connection is not None:
@@ -305,28 +279,11 @@ class JsonServer:
                 writer.close()
         self._waiting.discard(client)
         del self._clients[client]
-        self._asked.put(None)
-
-    def _lines(self, stream: BinaryIO) -> Iterator[bytes | None]:
-        """Those that hold anything; None for one that is too long."""
-        while piece := stream.readline(self._longest + 1):
-            line: bytes | None = piece
-            while len(piece) > self._longest and not piece.endswith(b"\n"):
-                piece, line = stream.readline(self._longest + 1), None
-            if line is None or line.strip():
-                yield line and line.strip()
 
     def _take(self, wait_s: float) -> None:
-        """Begin what was asked."""
         with contextlib.suppress(queue.Empty):
             while True:
-                request, wait_s = self._asked.get(timeout=wait_s), 0.0
-                if request is None:
-                    continue
+                line, arrived, answer = self._asked.get(timeout=wait_s)
                 self.requests += 1
-                if request.line is None:
-                    text = f"the request has more than {self._longest // 1024} KiB."
-                    request.work = iter([self._answers.refusal(DataError(text, hint="Ask for less at a time."))])
-                else:
-                    request.work = self._answers.begin(request.line, request.arrived)
-                self._begun.insert(0, request)
+                self._begun.insert(0, (self._answering(line, arrived), answer))
+                wait_s = 0.0

@@ -3,6 +3,7 @@
 A UDP port is of this machine; datagrams of others come by socat or SSH.
 """
 
+import contextlib
 import io
 import os
 import re
@@ -14,6 +15,7 @@ from armcal.errors import InputError, Location
 
 MAX_LINE_BYTES = 1024**2
 LOOPBACK = "127.0.0.1"
+_AT_ONCE = 4096  # A pipe that is ready takes so many bytes without waiting (PIPE_BUF)
 
 
 class LineCutter:
@@ -52,73 +54,43 @@ class LineCutter:
             self._open += piece
 
 
-PATIENCE_S = 5.0  # How long a reader may take, once; after that, lines are left out until it reads on
-
-_AT_ONCE = 4096  # A pipe that is ready takes so many bytes without waiting (PIPE_BUF)
-
-
 class StandardOutput:
     """Writes lines to a stream, and never fails: a reader that went away or sleeps must not stop a recalibration.
 
-    Attributes:
-        lost: lines that were left out since one was last written.
-        closed: whether the reader is gone.
+    ``patience_s`` is how long a reader may take, once; after that, lines are left out until it reads on.
     """
 
-    def __init__(self, stream: BinaryIO | None, patience_s: float = PATIENCE_S) -> None:
-        self._stream = stream
-        self._patience_s = patience_s
-        self._descriptor = _descriptor(stream)
-        self._begun = False
-        self.lost = 0
-        self.closed = stream is None
+    def __init__(self, stream: BinaryIO | None, patience_s: float = 5.0) -> None:
+        self._stream, self._patience_s, self._begun = stream, patience_s, False
+        self._descriptor: int | None = None
+        with contextlib.suppress(OSError, io.UnsupportedOperation):
+            self._descriptor = stream.fileno() if stream else None
+        self.lost = 0  # lines that were left out since one was last written
+        self.closed = stream is None  # whether the reader is gone
 
     def write(self, line: str) -> None:
-        """One line, without its end."""
-        if self.closed:
+        if self._stream is None or self.closed:
             return
+        data = memoryview((b"\n" if self._begun else b"") + line.encode() + b"\n")
         try:
             if self._descriptor is None:
-                assert self._stream is not None
-                self._stream.write(f"{line}\n".encode())
+                self._stream.write(data)
                 self._stream.flush()
-            elif not self._written(f"{line}\n".encode(), self._descriptor):
-                self.lost += 1
+                return
+            ready = select.poll()
+            ready.register(self._descriptor, select.POLLOUT)
+            while data:
+                count = 0
+                if ready.poll(0.0 if self.lost else self._patience_s * 1000):
+                    with contextlib.suppress(BlockingIOError):
+                        count = os.write(self._descriptor, data[:_AT_ONCE])
+                if not count:
+                    self.lost += 1
+                    return
+                data = data[count:]
+                self._begun = bool(data)
         except (OSError, ValueError):
             self.closed = True
-
-    def _written(self, data: bytes, descriptor: int) -> bool:
-        left = memoryview(b"\n" + data if self._begun else data)
-        while left:
-            count = write_ready(descriptor, left, 0.0 if self.lost else self._patience_s)
-            if not count:
-                return False
-            left = left[count:]
-            self._begun = bool(left)
-        return True
-
-
-def write_ready(descriptor: int, data: memoryview, wait_s: float = 0.0) -> int:
-    """Write what a descriptor takes without blocking, at most 4 KiB; the number of bytes, 0 if it does not get ready.
-
-    Raises:
-        OSError: nobody reads it any more.
-    """
-    poll = select.poll()
-    poll.register(descriptor, select.POLLOUT)
-    if not poll.poll(wait_s * 1000):
-        return 0
-    try:
-        return os.write(descriptor, data[:_AT_ONCE])
-    except BlockingIOError:
-        return 0
-
-
-def _descriptor(stream: BinaryIO | None) -> int | None:
-    try:
-        return None if stream is None else stream.fileno()
-    except (OSError, io.UnsupportedOperation):
-        return None
 
 
 def port_of(text: str) -> int | None:
@@ -128,11 +100,6 @@ def port_of(text: str) -> int | None:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A socket that does not block.
-
-    Raises:
-        InputError: the port cannot be opened.
-    """
     where = Location(f"udp:{host}:{port}")
     try:
         kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]

@@ -20,14 +20,13 @@ T = TypeVar("T")
 R = TypeVar("R")
 Report = Callable[[float], None]  # Takes which fraction of the work is done
 
-WORTH_WORKERS_S = 6.0  # Starting worker processes takes a second or two: not worth it for less work than this
 MOST_PROCESSES = 1024
 _SAFE_PATH = "PYTHONSAFEPATH"
 _OPTION = Location("--parallel")
 
 
 def unreported(fraction: float) -> None:
-    """Tells nobody."""
+    pass
 
 
 @dataclass(frozen=True)
@@ -39,34 +38,24 @@ class Executor:
     """
 
     processes: int | None = None
-    worth_s: float = WORTH_WORKERS_S
+    worth_s: float = 6.0  # starting worker processes takes a second or two: not worth it for less work than this
 
     def map(self, work: Callable[[T], R], tasks: Sequence[T], report: Report = unreported) -> list[R]:
-        """``work`` of each task, in order; the first exception of any ends it and is raised as it was.
-
-        Raises:
-            InputError: a task cannot be sent to another process.
-            ArmcalError: a worker process ended without an answer.
-        """
+        """``work`` of each task, in order; the first exception of any ends it and is raised as it was."""
         results: list[R] = []
         began = time.perf_counter()
         for number, task in enumerate(tasks):
             report(number / len(tasks))
-            if self._hands_over(number, len(tasks), time.perf_counter() - began, (work, task)):
-                self._map_elsewhere(work, tasks, results, report)
+            hands_over = (self.processes or 1) > 1
+            if self.processes is None and number and (remaining := len(tasks) - number) > 1:
+                spent = time.perf_counter() - began
+                hands_over = spent / number * remaining > self.worth_s and _picklable((work, task))
+            if hands_over:
                 break
             results.append(work(task))
-        report(1.0)
-        return results
-
-    def _hands_over(self, number: int, count: int, spent: float, what: object) -> bool:
-        if self.processes is not None:
-            return self.processes > 1
-        remaining = count - number
-        return bool(number and remaining > 1 and spent / number * remaining > self.worth_s and _picklable(what))
-
-    def _map_elsewhere(self, work: Callable[[T], R], tasks: Sequence[T], results: list[R], report: Report) -> None:
-        """Append the results of the tasks that have none, from worker processes."""
+        else:
+            report(1.0)
+            return results
         import joblib
 
         tasks, count = tasks[len(results) :], len(tasks)
@@ -97,14 +86,11 @@ class Executor:
                 del os.environ[_SAFE_PATH]
             else:
                 os.environ[_SAFE_PATH] = before
+        report(1.0)
+        return results
 
 
 def parse_executor(text: str) -> Executor:
-    """What ``--parallel`` says.
-
-    Raises:
-        InputError: it is no number of processes.
-    """
     text = text.strip()
     if text == "auto":
         return Executor()

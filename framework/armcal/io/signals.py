@@ -14,13 +14,10 @@ class Signals:
     """While it is entered: SIGTERM and SIGINT ask for the end; SIGHUP, for a new file, ends nothing by itself.
 
     Outside the main thread there are none.
-
-    Attributes:
-        finish, rotate: what was asked for.
     """
 
     def __init__(self, numbers: Iterable[int] = (*FINISH, ROTATE)) -> None:
-        self.finish = self.rotate = False
+        self.finish = self.rotate = False  # what was asked for
         self.before: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
 
     def __enter__(self) -> Self:

@@ -35,7 +35,7 @@ from armcal.estimate.polish import settled, untrained
 from armcal.estimate.prediction import residual_spread
 from armcal.estimate.uncertainty import Bootstrap
 from armcal.estimate.validation import ErrorSummary, Recording, Split, in_unit, summarise
-from armcal.io import folder as folders
+from armcal.io import plain_files
 from armcal.measure.csv_writer import csv_text
 from armcal.measure.reader import surroundings
 from armcal.plugins import PluginRegistry
@@ -263,9 +263,9 @@ _OURS = (
 )
 
 
-def reserved(folder: Path) -> AbstractContextManager[folders.Reservation]:
+def reserved(folder: Path) -> AbstractContextManager[plain_files.Reservation]:
     """Keep a folder for one run."""
-    return folders.reserved(folder, _OURS)
+    return plain_files.reserved(folder, _OURS)
 
 
 def calibration_name(result: RunResult, accepted: bool) -> str:
@@ -276,7 +276,7 @@ def calibration_name(result: RunResult, accepted: bool) -> str:
 
 
 def write(
-    held: folders.Reservation, result: RunResult, experiment: Experiment, page: str, accepted: bool = False
+    held: plain_files.Reservation, result: RunResult, experiment: Experiment, page: str, accepted: bool = False
 ) -> None:
     """Write all files into a reserved folder; those of an earlier run in the same place move to ``earlier/``.
 

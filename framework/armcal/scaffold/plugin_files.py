@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from armcal.config.yaml_nodes import word
+from armcal.config.yaml_source import word
 from armcal.errors import InputError, Location
 from armcal.hooks import KINDS as HOOKS
 from armcal.io.plain_files import writing
@@ -70,7 +70,6 @@ def staged(folder: Path) -> Iterator[Path]:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Texts by their path in a folder, in UTF-8 with plain line ends."""
     for name, text in texts.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -85,10 +84,9 @@ def plugin_name(text: str, registry: PluginRegistry) -> str:
         mend = f"Leave {PREFIX} out: the package gets it by itself."
         raise InputError(f"found the name {text!r}, expected what comes after {PREFIX}.", hint=mend)
     if not _PLUGIN.fullmatch(name) or keyword.iskeyword(name):
-        raise InputError(
-            f"found the name {text!r}, expected a Python name of small letters, digits, - and _.",
-            hint="Begin with a letter, as in draw-wire.",
-        )
+        text = f"found the name {text!r}, expected a Python name of small letters, digits, - and _."
+        hint = "Begin with a letter, as in draw-wire."
+        raise InputError(text, hint=hint)
     taken = next((f"a plugin is called {name!r} already" for plugin in registry.plugins if plugin.name == name), "")
     for own in (component for component in registry.components if component.name == name):
         taken = f"the plugin {own.plugin!r} offers the {own.kind} {name!r} already"

@@ -26,10 +26,10 @@ from armcal.testing.checking import JOINTS, RESULTS, Subject, check, expect
 from armcal.testing.planar import ARM, GRAVITY, SkewedArm, all_parameters, planar_arms
 
 _STEP, _JACOBIAN_TOLERANCE, _ROTATION_TOLERANCE = 1e-5, 1e-6, 1e-9
+# What a unit of a parameter moves, in the same unit: about one. A degree is 0.017 rad, a millimetre 0.001 m.
 _LEAST_GAINS, _MOST_GAIN, _NOTHING = {"m": 5e-3, "rad": 0.05}, 20.0, 1e-9
-"""What a unit of a parameter moves, in the same unit: about one. A degree is 0.017 rad, a millimetre 0.001 m."""
+# By unit: the largest nominal value, and the largest ordinary correction, that any arm could mean.
 _LARGEST = {"m": (100.0, 1.0), "rad": (4 * math.pi, math.pi), "kpx": (20.0, 5.0)}
-"""By unit: the largest nominal value, and the largest ordinary correction, that any arm could mean."""
 _BRANCHING = "LT LE EQ NE NOT AND OR IF_ELSE_ZERO SIGN FABS FMIN FMAX FLOOR CEIL FMOD COPYSIGN REMAINDER MMIN MMAX"
 _CHOICES = {getattr(ca, f"OP_{name}"): name.lower() for name in _BRANCHING.split()}
 
@@ -38,32 +38,24 @@ _CHOICES = {getattr(ca, f"OP_{name}"): name.lower() for name in _BRANCHING.split
 
 @dataclass(frozen=True)
 class View:
-    """Something that a component gives, as an expression.
-
-    Attributes:
-        rows: the unit of each number of it (``any``: m or rad), where that is known.
-        given: what it is derived by (column of symbols): its parameters, and readings, loads or displacements.
-        columns: the name and the unit of each number that is given, with no unit where it is not compared.
-        points: values of what is given.
-        recorded, states: commands and conditions, by which it may choose, and values of them.
-    """
+    """Something that a component gives, as an expression."""
 
     what: str
     expression: Expression
-    rows: Sequence[str]
-    given: Expression
-    columns: Sequence[tuple[str, str]]
-    points: Sequence[Array]
-    recorded: Expression
-    states: Sequence[Array] = (np.zeros(0),)
-
-    def function(self, expression: Expression) -> ca.Function:
-        return ca.Function("shown", [self.given, self.recorded], [ca.densify(expression)])
+    rows: Sequence[str]  # the unit of each number of it (``any``: m or rad), where that is known
+    given: Expression  # what it is derived by (column): its parameters, and readings, loads or displacements
+    columns: Sequence[tuple[str, str]]  # name and unit of each number that is given; no unit where it is not compared
+    points: Sequence[Array]  # values of what is given
+    recorded: Expression  # commands and conditions, by which it may choose
+    states: Sequence[Array] = (np.zeros(0),)  # values of these
 
     def at_all(self, expression: Expression) -> Array:
         """An expression at each point and state."""
         function = self.function(expression)
         return np.array([np.asarray(function(*at)) for at in product(self.points, self.states)])
+
+    def function(self, expression: Expression) -> ca.Function:
+        return ca.Function("shown", [self.given, self.recorded], [ca.densify(expression)])
 
     def values(self) -> Array:
         return self.at_all(self.expression)[:, :, 0]
@@ -100,7 +92,6 @@ def _near_nominal(blocks: Sequence[ParameterBlock], random: np.random.Generator)
 
 
 def _stacked(parts: Sequence[Expression]) -> Expression:
-    """Expressions of any shape as one dense column."""
     return ca.densify(ca.vertcat(ca.SX(0, 1), *[ca.vec(ca.SX(part)) for part in parts]))
 
 
@@ -154,8 +145,8 @@ RESULTS["model"] = lambda s, model: (tuple(model.parameters()), _poses(s, model,
 
 # --- joint effects, on joints q1, q2 and q3 -------------------------------------------------------------------------
 
+# Command and approach of each joint.
 _STATES = [np.array([*at] * len(JOINTS)) for at in product((0.0, 0.4, -1.2, 2.0), (-1.0, 0.0, 1.0))]
-"""Command and approach of each joint."""
 
 
 @check("effect", needed=True)
@@ -213,8 +204,8 @@ RESULTS["effect"] = lambda s, effect: [
 
 # --- measurements, on arms every point of whose tool moves in a way of its own ---------------------------------------
 
+# By dimension: the largest standard deviation (m, rad, kpx) of an example that is worth calibrating with.
 _NOISIEST = {"length": 0.1, "angle": 0.5, "image": 0.05}
-"""By dimension: the largest standard deviation (m, rad, kpx) of an example that is worth calibrating with."""
 _INSTRUMENT = "instrument"
 _GROUP = "front/hole"
 

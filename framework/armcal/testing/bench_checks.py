@@ -4,12 +4,12 @@ No port is opened, for something may be plugged in. Live sources never wait; dam
 """
 
 import math
+import multiprocessing
 import socket
-import threading
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, wait
 from contextlib import closing, suppress
 from copy import deepcopy
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -24,12 +24,11 @@ from armcal.errors import InputError
 from armcal.testing.checking import ContractError, NotRun, Subject, check, expect
 
 T = TypeVar("T")
-JOINTS, CHANNELS = ("q1", "q2"), ("arm.q1", "arm.q2")
-"""The joints that a device's ``EXAMPLE`` must know, and the channels of a joint stream."""
-_NEAR_RAD, _SAME_RAD, _REGISTERS = 0.02, 1e-9, 256
-"""So near to an angle must a board's pulses come; so near are equal angles."""
-_PATIENCE_S = 5.0
-"""Whoever takes longer than this to say what has come is waiting."""
+JOINTS = ("q1", "q2")  # that a device's ``EXAMPLE`` must know
+CHANNELS = ("arm.q1", "arm.q2")  # of a joint stream
+_NEAR_RAD, _SAME_RAD = 0.02, 1e-9  # so near to an angle must a board's pulses come; so near are equal angles
+_REGISTERS = 256
+_PATIENCE_S = 5.0  # whoever takes longer than this to say what has come is waiting
 _DAMAGED = (
     b"\xff\xfe\xfd broken\n",
     b"[" * 20_000 + b"\n",
@@ -136,9 +135,9 @@ class _MemoryLink:
 
 # --- live sources ---------------------------------------------------------------------------------------------------
 
+# What has come of each kind of source, and what it is opened with beside the clock.
 _TAKEN: Mapping[str, Callable[[Any], list[Any]]] = {"tracker": frames_of, "joints": samples_of, "camera": shots_of}
 _OPENED: Mapping[str, tuple[Any, ...]] = {"tracker": (), "joints": (CHANNELS,), "camera": ({},)}
-"""What has come of each kind of source, and what it is opened with beside the clock."""
 
 
 @check("tracker", "joints", "camera", needed=True)
@@ -178,26 +177,18 @@ def damaged_bytes_are_passed_over_and_counted(s: Subject) -> None:
 
 def _within(call: Callable[[], T]) -> T:
     """What a call gives, if it does not wait."""
-    future = Future[T]()
-
-    def run() -> None:
-        try:
-            future.set_result(call())
-        except BaseException as fault:
-            future.set_exception(fault)
-
-    threading.Thread(target=run, daemon=True).start()
-    wait([future], _PATIENCE_S)
-    waits = f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once"
-    expect(future.done(), waits)
-    return future.result()
+    try:
+        return ThreadPool(1).apply_async(call).get(_PATIENCE_S)
+    except multiprocessing.TimeoutError as fault:
+        text = f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once"
+        raise ContractError(text) from fault
 
 
 def _settings_to_feed(s: Subject, path: Path) -> Mapping[str, Any]:
     fields = type(s.settings).model_fields
     if isinstance(s.example.get("port"), int):  # not that of a serial line
         return {"port": 0, **({"host": "127.0.0.1"} if "host" in fields else {})}
-    for name in ("path", "source"):
+    for name, feed in (("path", str(path)), ("source", "udp:0")):
         if name in fields:
-            return {name: str(path)}
+            return {name: feed}
     raise NotRun("its settings have no port, path or source by which the checks could feed it")

@@ -16,36 +16,26 @@ class NotRun(Exception):  # noqa: N818 (not an error: a reason)
 
 
 class Subject(SimpleNamespace):
-    """A component under check, and what earlier checks made of it.
+    """A component under check, and what earlier checks made of it."""
 
-    Attributes:
-        kind: what it is registered as.
-        made: its class.
-        example, settings: its example as a configuration would have it, and as settings.
-        arguments: what it was built with last, beside its settings.
-    """
-
-    kind: str
-    made: Any
-    example: dict[str, Any]
-    settings: Any
-    arguments: tuple[Any, ...]
+    kind: str  # what it is registered as
+    made: Any  # its class
+    example: dict[str, Any]  # as a configuration would have it
+    settings: Any  # of its example
+    arguments: tuple[Any, ...]  # what it was built with last, beside its settings
 
     def build(self, *arguments: Any) -> Any:
         self.arguments = arguments
         return self.made(self.settings, *arguments)
 
     def with_settings(self, **settings: Any) -> Any:
-        """Another one, of its example but for these settings."""
         return self.made(self.made.Settings.model_validate({**self.example, **settings}))
 
 
 Check = Callable[[Subject], None]
-CHECKS: dict[str, list[Check]] = {}
-"""Of each kind what is checked, in this order, after what every component is checked for."""
+CHECKS: dict[str, list[Check]] = {}  # by kind, in this order, after what every component is checked for
 NEEDED: set[Check] = set()
-RESULTS: dict[str, Callable[[Subject, Any], object]] = {}
-"""Of each kind what a component gives, from which it is seen whether it gives the same each time."""
+RESULTS: dict[str, Callable[[Subject, Any], object]] = {}  # by kind what a component gives: the same each time
 
 
 def check(*kinds: str, needed: bool = False) -> Callable[[Check], Check]:
@@ -62,18 +52,16 @@ def check(*kinds: str, needed: bool = False) -> Callable[[Check], Check]:
 
 
 def expect(holds: bool, fault: str) -> None:
-    """Raise ContractError unless something holds."""
     if not holds:
         raise ContractError(fault)
 
 
 JOINTS = ("q1", "q2", "q3")
-_BUILT_OF: dict[str, tuple[tuple[Any, ...], ...]] = {
+_BUILT_OF: dict[str, tuple[tuple[Any, ...], ...]] = {  # beside its settings: the first that it does not refuse
     "effect": ((JOINTS,),),
     "residual": ((JOINTS,),),
     "measurement": ((("arm",),), (("left", "right"),)),
 }
-"""Of which joints or arms, beside its settings: the first that a component does not refuse."""
 
 
 @check("model", "effect", "residual", "measurement", "reader", "simulator", "exporter", needed=True)

@@ -35,21 +35,18 @@ from armcal.testing.checking import (
 )
 
 MOST_CHARACTERS = 400
-_QUANTITIES = (
+_QUANTITIES = (  # words in the names of settings that are quantities
     "length distance height width depth radius diameter noise angle angles mass payload compliance force torque "
     "temperature acceleration duration timeout"
 )
-"""Words in the names of settings that are quantities."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """What one check found: nothing, if ``fault`` is empty; ``not_run`` says why it could not run."""
-
     component: str
     check: str
-    fault: str = ""
-    not_run: str = ""
+    fault: str = ""  # what it found
+    not_run: str = ""  # why it could not run
 
 
 # --- what every component must do -----------------------------------------------------------------------------------

@@ -29,17 +29,7 @@ from armcal.measure.measurement import Channel
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
 from armcal.testing.checking import RESULTS, ContractError, NotRun, Subject, check, expect
-from armcal.testing.planar import (
-    ARM,
-    GRAVITY,
-    NOISE_M,
-    TRACKER,
-    Tip,
-    all_parameters,
-    commands,
-    dataset,
-    planar_arms,
-)
+from armcal.testing.planar import ARM, GRAVITY, NOISE_M, TRACKER, Tip, all_parameters, commands, dataset, planar_arms
 
 # --- readers --------------------------------------------------------------------------------------------------------
 
@@ -50,7 +40,7 @@ r1,0.8,0,0.6,0,30,45,324.5,0,-391.5
 r2,0.96,0,-0.28,0,-60,5,293.4,0,464.6
 r3,0,0,1,0,90,120,-216.5,0,-175
 """
-_PLAIN: Mapping[str, Any] = {
+_PLAIN: Mapping[str, Any] = {  # as ``csv`` reads it, in the form of a reader's own ``EXAMPLE_SOURCE``
     "files": {"data.csv": _TABLE},
     "path": "data.csv",
     "channels": {
@@ -62,12 +52,9 @@ _PLAIN: Mapping[str, Any] = {
         "tracker.qy": (0, 0.6, -0.28, 1),
     },
 }
-"""As ``csv`` reads it, in the form of a reader's own ``EXAMPLE_SOURCE``."""
 
 
 class _Body(Tip):
-    """What has a pose's columns, for readers."""
-
     def channels(self) -> tuple[Channel, ...]:
         return (*super().channels(), *(Channel(f"q{axis}", "dimensionless") for axis in "wxyz"))
 
@@ -111,7 +98,6 @@ def a_cell_that_is_wrong_or_empty_is_reported_never_passed_over(s: Subject) -> N
 
 
 def _read(s: Subject, cell: bytes | None = None) -> Dataset:
-    """The records of the known files, or of these with a cell that is another."""
     if "path" not in type(s.settings).model_fields:
         raise NotRun("its settings have no path")
     instrument = _Body() if f"{TRACKER}.qw" in s.source["channels"] else Tip()
@@ -147,13 +133,7 @@ RESULTS["reader"] = _records
 # --- exporters, of a planar arm --------------------------------------------------------------------------------------
 
 
-@check("exporter")
-def it_writes_an_arm_or_refuses_it_by_an_armcal_error_and_leaves_its_values_alone(s: Subject) -> None:
-    _exported(s.built)
-
-
 def _exported(exporter: Exporter) -> object:
-    """What it writes, or why it refuses."""
     arm = planar_arms([ARM])[ARM]
     nominal = {block.name: np.array(block.nominal) for block in arm.parameters()}
     request = ExportRequest(ARM, arm, {name: value.copy() for name, value in nominal.items()})
@@ -165,6 +145,11 @@ def _exported(exporter: Exporter) -> object:
     expect(same, "it changes the values that it is given")
     expect(isinstance(exported.content, bytes), f"found content of type {type(exported.content).__name__}, not bytes")
     return exported.content, dict(exported.companions)
+
+
+@check("exporter")
+def it_writes_an_arm_or_refuses_it_by_an_armcal_error_and_leaves_its_values_alone(s: Subject) -> None:
+    _exported(s.built)
 
 
 RESULTS["exporter"] = lambda s, exporter: _exported(exporter)
@@ -224,8 +209,6 @@ def of_a_sound_fit_it_gives_findings_or_none_and_none_is_bad(s: Subject) -> None
 
 @dataclass(frozen=True)
 class _Exact:
-    """An estimator that knows the truth."""
-
     solution: Solution
 
     def solve(self, problem: Problem, start: Array, progress: Any = None) -> Solution:
@@ -268,8 +251,7 @@ def _expect_near(solution: Solution, answers: Mapping[str, float]) -> None:
 # --- online estimators: a linear problem whose answer is a sum of information ---------------------------------------
 
 _STATES, _ROWS = 4, 2
-_SHARE = 1e-7
-"""How far a number may be off, in its standard deviation."""
+_SHARE = 1e-7  # how far a number may be off, in its standard deviation
 
 
 @dataclass(frozen=True)

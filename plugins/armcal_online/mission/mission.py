@@ -25,9 +25,8 @@ from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Progress, no_progress
-from armcal.io.folder import reserved
 from armcal.io.lines import StandardOutput
-from armcal.io.plain_files import writing
+from armcal.io.plain_files import reserved, writing
 from armcal.measure.csv_writer import csv_text, write_csv
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem

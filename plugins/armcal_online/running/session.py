@@ -11,10 +11,10 @@ from typing import Any
 import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.errors import ConfigError, DataError, InputError, Location, PluginError
-from armcal.io.folder import check_folder
 from armcal.io.journal import JOURNAL_FILES, Entry, Journal, KeptJournal, has_journal
 from armcal.io.json_server import JsonClient, JsonServer
 from armcal.io.lines import StandardOutput
+from armcal.io.plain_files import check_folder
 from armcal.plugins import PluginRegistry
 
 from armcal_online.running.loop import RECORD, STARTED, Pace, Recalibration, StateReplayer

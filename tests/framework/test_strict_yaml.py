@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 import yaml
 from armcal.base.config_text import ConfigText
-from armcal.config import yaml_nodes
-from armcal.config.yaml_nodes import Origin, read_nodes
-from armcal.config.yaml_source import ConfigSource, load_config
+from armcal.config import yaml_source
+from armcal.config.yaml_source import ConfigSource, Origin, load_config, read_nodes
 from armcal.errors import ConfigError
 
 SAMPLE = """\
@@ -176,8 +175,8 @@ def test_a_file_over_sixteen_mebibytes_is_refused_and_one_at_the_limit_is_read(t
 @pytest.mark.slow
 def test_fifty_levels_are_read_and_values_up_to_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load(tmp_path, "a: " + "[" * 49 + "]" * 49).data["a"] is not None
-    assert yaml_nodes.MAX_NODES == 1_000_000
-    monkeypatch.setattr(yaml_nodes, "MAX_NODES", 100_000)
+    assert yaml_source.MAX_NODES == 1_000_000
+    monkeypatch.setattr(yaml_source, "MAX_NODES", 100_000)
     assert len(load(tmp_path, f"a: [{'1,' * 99_990}]").data["a"]) == 99_990
     assert "more than 100000 values" in refusal(tmp_path, f"a: [{'1,' * 100_000}]")
 
