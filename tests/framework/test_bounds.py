@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from armcal.calibration.calibration_file import parameter_records
 from armcal.cli.console import Screen
-from armcal.diagnose.verdict import shift_findings
+from armcal.diagnose.verdict import shifts
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
 from armcal.report.run_document import parameters_table, principal_table
 from armcal.run.experiment import Experiment
+from fits import fit_that_found
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 NOISE_M = 0.0005
@@ -56,13 +57,13 @@ def test_an_estimate_far_beyond_its_bound_keeps_an_interval_as_wide_as_its_devia
 
 
 def test_what_a_bound_shifts_beside_itself_is_named(beyond: Estimate) -> None:
-    (finding,) = shift_findings(beyond)
+    (finding,) = shifts(fit_that_found(beyond, {}))
     assert finding.grade == "note" and "Bounds that hold arm.spring.k2 shift other estimates" in finding.text
     moved = (beyond.free_values - beyond.unconstrained) / beyond.deviations
     worst = max((n for n in beyond.names if n != "arm.spring.k2"), key=lambda n: abs(moved[beyond.names.index(n)]))
     assert f"{worst} ({moved[beyond.names.index(worst)]:+.1f} sd)" in finding.text
     free = fitted(SPRINGS, {**BEYOND, "arm.spring.k2": 0.05})
-    assert not shift_findings(free)
+    assert not shifts(fit_that_found(free, {}))
 
 
 @pytest.mark.parametrize(
@@ -140,9 +141,9 @@ def test_what_a_cone_shifts_beside_its_matrix_is_named() -> None:
         for along in (-0.01, 0.05)
     )
     assert not edge.at_bound
-    (finding,) = shift_findings(edge)
+    (finding,) = shifts(fit_that_found(edge, {}))
     moved = dict(zip(edge.names, (edge.free_values - edge.unconstrained) / edge.deviations, strict=True))
     worst = max((n for n in edge.names if n.startswith("arm.mdh")), key=lambda n: abs(moved[n]))
     assert f"Bounds that hold arm.flex.C2 shift other estimates: {worst} ({moved[worst]:+.1f} sd)" in finding.text
     assert finding.grade == "note" and "C2[" not in finding.text
-    assert not shift_findings(inside)
+    assert not shifts(fit_that_found(inside, {}))

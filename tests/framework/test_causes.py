@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -12,12 +11,12 @@ import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.causes import predicted_positions
 from armcal.diagnose.fit import FitRows
-from armcal.diagnose.residual_structure import LEVEL, UNLISTED, neighbour_findings, structure, structure_findings
-from armcal.diagnose.unseen import scale_deviation
+from armcal.diagnose.gross import scale_deviation
+from armcal.diagnose.residual_structure import LEVEL, UNLISTED, depends, neighbours, structure
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
-from fits import fit_of
+from fits import fit_of, fit_that_left
 from noise_cases import NOISE_M, posed
 
 DEG = np.pi / 180
@@ -110,7 +109,7 @@ def graded(found, name):
 
 
 def said(found):
-    return " ".join(finding.whole for finding in structure_findings(found))
+    return " ".join(finding.whole for finding in depends(fit_that_left(found)))
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -227,11 +226,11 @@ def test_time_is_blamed_only_where_poses_do_not_follow_it(lrm, name, in_order, c
     found = found_in(lrm, name, 0, in_order)
     assert found.lag_p <= LEVEL
     assert found.predictable is not None and found.predictable.cause == cause
-    finding = next(f for f in structure_findings(found) if "time" in f.text and "pose predicts" in f.text)
+    finding = next(f for f in depends(fit_that_left(found)) if "time" in f.text and "pose predicts" in f.text)
     assert ("It goes with time" in finding.text) == (cause == "time")
     assert ("Let the base drift" in finding.action) == (cause == "time")
     assert ("do not show whether the pose or time is the cause" in finding.text) == (cause == "open")
-    assert neighbour_findings(found, SimpleNamespace(widened=()))[0].grade == "note"
+    assert neighbours(fit_that_left(found))[0].grade == "note"
 
 
 @pytest.mark.slow

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.fit import widened
-from armcal.diagnose.residual_structure import _what_neighbours_cost
+from armcal.diagnose.residual_structure import neighbours, structure
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
+from fits import fit_that_found
 from scipy.special import stdtrit
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
@@ -54,13 +56,20 @@ def held(estimates: list[tuple[Estimate, Estimate, np.ndarray]], which: int) -> 
     return float(np.mean(shares))
 
 
+def cost(estimate: Estimate) -> str:
+    """What the verdict says of it where neighbours correlate."""
+    outcome = SimpleNamespace(level=0.01, lag_p=0.001, lag_one=0.5, lag_after_p=0.001, lag_after=0.5, structures=())
+    (finding,) = neighbours(fit_that_found(estimate, {structure: outcome}))
+    return finding.text
+
+
 def test_along_a_path_intervals_grow_and_the_verdict_says_by_how_much() -> None:
     (plain, wide, _), *_ = estimates("path", range(1), 120)
     assert wide.widened and np.median(wide.widened) > 1.5
     np.testing.assert_allclose(wide.deviations, plain.deviations * wide.widened)
     inverse = np.linalg.inv(wide.square_root_information)
     np.testing.assert_allclose(np.sqrt(np.sum(inverse**2, axis=1)), wide.deviations, rtol=1e-6)
-    text = _what_neighbours_cost(wide)
+    text = cost(wide)
     assert "wider, by a factor of" in text and wide.names[int(np.argmax(wide.widened))] in text
 
 
@@ -70,7 +79,7 @@ def test_in_random_order_they_do_not_and_nobody_says_so() -> None:
     assert wide.widened is not None
     assert np.median(wide.widened or (1.0,)) < 1.15
     if not wide.widened:
-        assert "does not widen" in _what_neighbours_cost(wide)
+        assert "does not widen" in cost(wide)
 
 
 @pytest.mark.slow

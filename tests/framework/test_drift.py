@@ -13,9 +13,10 @@ import pytest
 from armcal.base.parameters import Drift
 from armcal.cli.main import cli
 from armcal.diagnose.causes import contradictions
+from armcal.diagnose.gross import rounding
 from armcal.diagnose.residual_structure import structure
-from armcal.diagnose.unseen import rounding
-from armcal.diagnose.verdict import LEVEL, _good_for, _size
+from armcal.diagnose.verdict import LEVEL, _good_for
+from armcal.diagnose.verdict import noise as noise_findings
 from armcal.errors import DataError
 from armcal.estimate.estimator import estimate
 from armcal.estimate.prediction import KnownDrift, Predictor
@@ -399,7 +400,8 @@ def test_a_drift_as_stated_is_no_error_of_the_model(lrm, seeds):
         problem = problem.with_records(records)
         fit = estimate(problem, SOLVER.solve(problem, problem.parameters.nominal()))
         none = {structure: None, contradictions: (), rounding: None}
-        finding = _size(fit_that_found(fit, none, unit="mm", errors=SimpleNamespace(calibrated_mm=np.ones(1))))
+        errors = SimpleNamespace(calibrated_mm=np.ones(1))
+        (finding,) = noise_findings(fit_that_found(fit, none, unit="mm", errors=errors))
         assert finding.grade == "warning" or "model explains the data" in finding.text
         warned += finding.grade == "warning"
     low, high = binom.ppf([1e-3, 1 - 1e-3], len(seeds), LEVEL / 2)

@@ -8,7 +8,7 @@ from pathlib import Path
 import contact_oracle as co
 import numpy as np
 from armcal.base.dataset import Dataset
-from armcal.diagnose.unseen import Elsewhere, away, away_from_contacts, elsewhere
+from armcal.diagnose.verdict import Elsewhere, away, away_from_contacts, elsewhere
 from armcal.estimate.polish import started
 from armcal.estimate.robust import fit
 from armcal.run.experiment import Experiment

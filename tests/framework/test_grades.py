@@ -6,12 +6,16 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import planted_mistakes
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.gross import overfitted
+from armcal.diagnose.fit import Fit, Prepared
+from armcal.diagnose.gross import overfit
+from armcal.estimate.robust import WeighedFit
+from armcal.estimate.validation import Split
 from armcal.planning.suggestion import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
@@ -118,6 +122,18 @@ def test_a_fit_with_nearly_as_many_parameters_as_equations_is_overfitted(tmp_pat
     assert code == 0 and any("Overfitted: records that did not train have an error of" in text for text in texts)
 
 
+def fit_with(trained: np.ndarray, judged: np.ndarray, nominal: np.ndarray, equations: int, freedom: float) -> Fit:
+    """Errors of records that trained, and of as many that judge (mm)."""
+    nothing = trained + np.nan
+    errors = SimpleNamespace(calibrated_mm=np.r_[trained, judged], at_rest_mm=None, rival_mm=np.r_[nothing, nominal])
+    every = np.arange(2 * len(trained))
+    problem = SimpleNamespace(blueprint=SimpleNamespace(arms={}), equations=lambda: equations)
+    ready = Prepared(None, None, problem, Split(every[: len(trained)], every[len(trained) :]), None)
+    fit = Fit(ready, WeighedFit(None, SimpleNamespace(degrees_of_freedom=freedom), problem, ()), None)
+    vars(fit).update(errors=errors, judged_mm=np.r_[nothing, judged], unit="mm")
+    return fit
+
+
 def test_what_the_parameters_take_of_the_training_errors_is_no_overfitting() -> None:
     """Least squares on random columns, p of m equations: the error is as the formula has it until p is nearly m."""
     rng, equations = np.random.default_rng(0), 90
@@ -127,14 +143,14 @@ def test_what_the_parameters_take_of_the_training_errors_is_no_overfitting() -> 
         values = rng.normal(size=2 * equations)
         found = np.linalg.lstsq(columns[:equations], values[:equations], rcond=None)[0]
         errors = np.linalg.norm((values - columns @ found).reshape(-1, 3), axis=1)
-        return bool(overfitted(errors[:30], errors[30:], errors[30:] + np.nan, equations, equations - spent))
+        return bool(overfit(fit_with(errors[:30], errors[30:], errors[30:] + np.nan, equations, equations - spent)))
 
     assert not any(judged(spent) for spent in (5, 30, 60, 60, 60)) and all(judged(88) for _ in range(5))
 
 
 def test_overfitting_is_bad_where_the_nominal_arm_is_as_good() -> None:
     trained, unseen = np.full(30, 0.1), np.full(30, 1.0)
-    grades = [overfitted(trained, unseen, np.full(30, nominal), 90, 80)[0].grade for nominal in (0.9, 1.1)]
+    grades = [overfit(fit_with(trained, unseen, np.full(30, nominal), 90, 80))[0].grade for nominal in (0.9, 1.1)]
     assert grades == ["bad", "warning"]
 
 

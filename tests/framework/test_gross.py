@@ -8,9 +8,11 @@ from typing import cast
 
 import numpy as np
 import pytest
+from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.diagnose.fit import Prepared
-from armcal.diagnose.gross import Figure, computed_findings, figure, size_findings
+from armcal.diagnose.gross import Figure, computed, figure
+from armcal.diagnose.gross import size as size_of
 from armcal.estimate.estimator import Estimate
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
@@ -36,8 +38,10 @@ def size(ready: Prepared, zero_rad: float, factor: float) -> float:
         own = parameters.entries_of(block.name)
         values[own] = values[own] * factor if block.unit == "m" else zero_rad
     known = SimpleNamespace(values=values, covariance=np.zeros((len(parameters.free_entries),) * 2))
-    own = figure(fit_that_found(cast(Estimate, known), {}, ready))
-    assert bool(size_findings(own)) == (factor != 1.0)
+    known.verdict = SimpleNamespace(converged=True)
+    fit = fit_that_found(cast(Estimate, known), {}, ready)
+    own = fit.of(figure)
+    assert bool(size_of(fit)) == (factor != 1.0)
     return own.size
 
 
@@ -61,8 +65,14 @@ def test_tips_that_are_computed_from_the_joints_are_named(
     nominal_mm: float, judged_mm: float, grade: str, words: str
 ) -> None:
     """As the controller reports them: by the nominal arm, or by the arm that its maker calibrated. Reach 1 m."""
-    figure = Figure(1000.0, 1.0, 0.0, 0.0, ())
-    findings = computed_findings(np.full(20, nominal_mm), np.append(np.full(9, judged_mm), np.nan), figure)
+    own = Figure(1000.0, 1.0, 0.0, 0.0, ())
+    factor = SimpleNamespace(position_channels=("tracker.x",))
+    problem = SimpleNamespace(kernels=(SimpleNamespace(factor=factor),))
+    ready = Prepared(None, Dataset(("1",), {"tracker.x": np.zeros(1)}), problem, None, None)
+    errors = SimpleNamespace(nominal_mm=np.full(20, nominal_mm))
+    known = {"errors": errors, "judged_mm": np.append(np.full(9, judged_mm), np.nan), "unit": "mm"}
+    estimate = SimpleNamespace(verdict=SimpleNamespace(converged=True))
+    findings = computed(fit_that_found(estimate, {figure: own}, ready, **known))
     assert [finding.grade for finding in findings] == [grade] * bool(grade)
     assert all(words in finding.text for finding in findings)
 

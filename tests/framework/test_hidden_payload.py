@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from armcal.diagnose.unseen import hidden_payload, payload
+from armcal.diagnose.gross import hidden_payload, payload
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
 from fits import fit_of, fit_that_found

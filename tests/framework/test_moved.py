@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import contact_oracle as co
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.gross import worse_than_nominal
-from armcal.diagnose.outliers import FEWEST, moved_groups
+from armcal.diagnose.outliers import FEWEST, moved
 from armcal.estimate.polish import mislabelled, settled, started, untrained
 from armcal_contact.contacts import BallInSocket, BallInSocketSettings
+from fits import fit_that_found
 
 NOISE = 2e-4
 PLACES = {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.38, 0.12, 0.27)}
@@ -36,7 +38,8 @@ def found(shift_m: float, before: int, count: int = 20, seed: int = 0):
     problem, records = co.Bench({"arm": co.the_arm(co.ELBOW)}, {"balls": ball}).problem(data)
     problem = started(problem.with_records(records))
     values = settled(untrained(problem).with_records(records), problem.parameters.nominal())
-    return moved_groups(problem, values)
+    estimate = SimpleNamespace(values=values, verdict=SimpleNamespace(converged=True))
+    return moved(fit_that_found(estimate, {}, acting=problem))
 
 
 @pytest.mark.parametrize("before", [4, 7, 15])

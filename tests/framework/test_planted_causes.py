@@ -11,10 +11,11 @@ from armcal.diagnose.fit import FitRows
 from armcal.diagnose.residual_structure import (
     Contest,
     ResidualStructure,
-    neighbour_findings,
-    repeat_findings,
-    structure_findings,
+    depends,
+    neighbours,
+    repeated,
 )
+from fits import fit_that_left
 from planted_causes import CAUSES, COUNT, DEG, LIMITS, Cause, experiment, graded, joint, left, recording, when
 
 SEEDS = 8
@@ -52,7 +53,8 @@ def along_a_path(seed: int) -> np.ndarray:
 
 
 def said(found: ResidualStructure) -> str:
-    findings = [*structure_findings(found), *neighbour_findings(found, SimpleNamespace(widened=()))]
+    fit = fit_that_left(found)
+    findings = [*depends(fit), *neighbours(fit)]
     return " ".join(finding.whole for finding in findings)
 
 
@@ -98,7 +100,7 @@ def test_repeats_in_each_rest_say_what_is_no_noise(tmp_path: Path, sags: bool) -
     found = left(base, cause, recording(base, cause, 1, q, 4e-5))
     assert found.repeats is not None and (found.repeats.poses, found.repeats.records) == (50, 150)
     assert found.repeats.scatter_mm == pytest.approx(0.069, rel=0.1)  # of three coordinates
-    findings = repeat_findings(found, "mm")
+    findings = repeated(fit_that_left(found))
     assert len(findings) == sags and (not sags or "the model lacks something" in findings[0].text)
 
 
@@ -111,7 +113,7 @@ def test_repeats_call_noise_the_models_error_as_often_as_the_level_says() -> Non
         noise = random.normal(size=3 * count)
         residual = noise - basis @ (basis.T @ noise)
         rows = FitRows(basis, residual, np.tile(np.arange(count), 3), numbers.T, whitening, (np.ones(count),), (True,))
-        found = Contest(rows, None, [], [], [], pose, np.ones(count - 1, dtype=bool))._repeats()
+        found = Contest(SimpleNamespace(rows=rows), [], [], [], pose, np.ones(count - 1, dtype=bool))._repeats()
         assert found is not None and not found.exceeded
         p_values.append(found.p_value)
     assert np.mean(np.array(p_values) < 0.01) <= 0.025 and 0.4 < np.mean(p_values) < 0.6

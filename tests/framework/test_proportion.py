@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import contact_oracle as co
 import numpy as np
 import pytest
-from armcal.diagnose.gross import Figure, Proportion, proportion, size_findings
+from armcal.diagnose.gross import Figure, Proportion, figure, proportion, size
 from armcal.estimate.polish import started
 from armcal.estimate.robust import fit
 from armcal_contact.contacts import BallInSocket
 from armcal_ipopt.estimator import IpoptEstimator
+from fits import fit_that_found
 
 IPOPT = IpoptEstimator(IpoptEstimator.Settings())
 PLACES = {"hole_0": (0.35, 0.1, 0.25), "hole_1": (0.2, -0.3, 0.35)}
@@ -51,8 +54,9 @@ def test_links_that_are_each_off_by_their_own_are_seldom_called_a_scale(each_by:
 
 def test_it_is_a_warning_with_its_size() -> None:
     def told(share: float) -> list[str]:
-        figure = Figure(1000.0, 1.0 + share, 0.0, 0.0, (), Proportion(5, share, 0.0007, (4.0, 1.5)))
-        return [f"{finding.grade}: {finding.text}" for finding in size_findings(figure)]
+        own = Figure(1000.0, 1.0 + share, 0.0, 0.0, (), Proportion(5, share, 0.0007, (4.0, 1.5)))
+        estimate = SimpleNamespace(verdict=SimpleNamespace(converged=True))
+        return [f"{finding.grade}: {finding.text}" for finding in size(fit_that_found(estimate, {figure: own}))]
 
     (longer,) = told(0.017)
     assert longer.startswith("warning: The 5 free lengths of the arm are 1.7 % (sd 0.07 %) longer than nominal")

@@ -23,20 +23,23 @@ from armcal.config.system import StaticsSettings, System
 from armcal.diagnose.causes import contradictions
 from armcal.diagnose.coverage import intervals
 from armcal.diagnose.fit import Fit, Prepared, RecordErrors
+from armcal.diagnose.gross import hidden_payload, rounding
 from armcal.diagnose.outliers import large_errors, noise_of, outlying
 from armcal.diagnose.residual_structure import depends, structure
-from armcal.diagnose.unseen import determined, elsewhere, hidden_payload, priors_alone, rounding
 from armcal.diagnose.verdict import (
     Verdict,
     bounds,
     conditioned,
     converged,
     correlated,
+    determined,
+    elsewhere,
     freedom,
     in_all,
     new_recording,
     next_poses,
     noise,
+    priors_alone,
     shifts,
     suggestions,
 )

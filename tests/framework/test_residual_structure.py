@@ -17,7 +17,7 @@ from armcal.diagnose.causes import Functions
 from armcal.diagnose.fit import FitRows, own_basis
 from armcal.diagnose.outliers import large_errors
 from armcal.diagnose.residual_structure import DRAWS, LEVEL, MOST_RECORDS, Contest, structure
-from armcal.diagnose.unseen import determined_finding, priors_alone, tip_by_priors, unseen_poses
+from armcal.diagnose.verdict import determined, priors_alone, tip_by_priors, unseen_poses
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
 from fits import fit_of
@@ -273,7 +273,7 @@ class Recorded:
     """No function of what was recorded moves a row."""
 
     def __init__(self, rows):
-        nothing = Functions(np.zeros((len(rows.residual), 1)), np.zeros((len(rows.by_record), 1)))
+        self.rows, nothing = rows, Functions(np.zeros((len(rows.residual), 1)), np.zeros((len(rows.by_record), 1)))
         self.of_pose = self.of_time = (nothing,)
 
 
@@ -284,7 +284,7 @@ def contest(rng, residual, columns=(), blocks=40, each=3, free=5):
     slopes = rng.normal(size=(2 * count, free))
     whitening = (np.repeat(np.eye(2)[:, :, None], count, axis=2),)
     rows = FitRows(slopes, residual, numbers.ravel() // 2, numbers, whitening, (np.ones(count),), (False,))
-    made = Contest(rows, Recorded(rows), [None] * len(columns), columns, [], np.arange(count), np.ones(count - 1, bool))
+    made = Contest(Recorded(rows), [None] * len(columns), columns, [], np.arange(count), np.ones(count - 1, bool))
     return made, slopes
 
 
@@ -325,7 +325,7 @@ def test_a_fit_takes_up_its_own_columns_and_finds_the_others():
     other, noise = rng.normal(size=(240, 1)), 0.3 * rng.normal(size=240)
     made, slopes = contest(np.random.default_rng(4), noise, [other])
     residual = noise + 2 * slopes[:, 0] + 0.5 * other[:, 0]
-    made = replace(made, rows=replace(made.rows, residual=residual))
+    made.recorded.rows = replace(made.rows, residual=residual)
     assert np.abs(slopes.T @ made.residual).max() < 1e-10
     assert own_basis(slopes[:, :2] @ rng.normal(size=(2, 3)), made.basis)[0].shape[1] == 0
     own, coefficients = own_basis(3 * other, made.basis)
@@ -452,9 +452,10 @@ def test_what_positions_at_their_ends_leave_open_shows_between_them(lrm):
     problem = lrm.problem(experiment, dataset, "interpreted", replace(freed, blocks=held))
     found = fit(problem, IPOPT, problem.parameters.nominal()).estimate
     assert len(found.identifiability.undetermined) == 1
-    alone = priors_alone(fit_of(problem, found, dataset))
+    own = fit_of(problem, found, dataset, judged_mm=np.full(1, 0.5))
+    alone = own.of(priors_alone)
     assert alone.worst_mm < 1e-6 and alone.between_mm > 0.5
-    finding = determined_finding(found, alone, 0.5)
+    (finding,) = determined(own)
     assert finding.grade == "warning" and "between its recorded positions" in finding.text
     assert "from both sides" in finding.action
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
-from armcal.diagnose.unseen import rounding
+from armcal.diagnose.gross import rounding
 from armcal.estimate.simulation import SimulationRequest
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate

@@ -10,21 +10,21 @@ import numpy as np
 import oracle
 import pytest
 from armcal.cli.main import cli
-from armcal.diagnose.causes import Functions, Recorded, Smooth
+from armcal.diagnose.causes import Functions, Records, Smooth
 from armcal.diagnose.fit import FitRows
 from armcal.diagnose.residual_structure import (
     FEWEST_POSES,
     Contest,
+    depends,
     percent,
     structure,
-    structure_findings,
 )
 from armcal.estimate.robust import fit
 from armcal.measure.groups import pose_numbers
 from armcal.problem.motion import Motion
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
-from fits import fit_of
+from fits import fit_of, fit_that_left
 from noise_cases import FEW, NOISE_M, posed
 from scipy.stats import multivariate_normal
 
@@ -52,9 +52,9 @@ class Residuals:
     def __init__(self, problem, estimate, dataset):
         self.dataset, self.motion = dataset, Motion.of(problem, estimate.values, dataset)
         rows = FitRows.of(problem, estimate)
-        recorded = Recorded.of(problem, rows, self.motion, dataset)
+        recorded = Records(problem, rows, dataset, self.motion)
         pose = pose_numbers(dataset, self.motion.channels)
-        self.contest = Contest(rows, recorded, [], [], [], pose, np.ones(len(dataset) - 1, dtype=bool))
+        self.contest = Contest(recorded, [], [], [], pose, np.ones(len(dataset) - 1, dtype=bool))
         self.rows = rows
 
     def along(self, joint, angle):
@@ -67,7 +67,8 @@ class Residuals:
 
     def judged(self, planted=0.0, seed=0, noise=None):
         own = np.random.default_rng(seed).normal(size=len(self.rows.residual)) if noise is None else noise.copy()
-        return replace(self.contest, rows=replace(self.rows, residual=own + planted)).outcome(frozenset(), True)
+        rows = replace(self.rows, residual=own + planted)
+        return replace(self.contest, recorded=replace(self.contest.recorded, rows=rows)).outcome(frozenset(), True)
 
 
 @pytest.fixture(scope="module")
@@ -169,8 +170,8 @@ def test_of_too_few_poses_nothing_is_known_however_often_they_were_repeated(lrm)
     own = fit_of(problem, estimate, dataset)
     left = own.of(structure)
     assert left.poses == FEWEST_POSES - 1 and left.predictable is None
-    assert any("too few distinct poses" in finding.text for finding in structure_findings(left))
-    none = structure_findings(None)
+    assert any("too few distinct poses" in finding.text for finding in depends(fit_that_left(left)))
+    none = depends(fit_that_left(None))
     assert "too few" in none[0].text and none[0].grade == "note"
 
 

@@ -1,22 +1,22 @@
 """What residuals might still depend on: parameters that instruments hold, causes, smooth functions of the records.
 
 A parameter of an instrument that a fit holds, a board's size, how it is bent, a lens, is estimated beside the free
-parameters, to first order at the fit. Rows of one record may err alike, as the corners of an image do: the deviation is
-that of sums over records, each residual divided by the root of what the fit left of it, and the t-test counts how few
-records bear it. [Bell2002]
+ones, to first order. Rows of one record may err alike, as the corners of an image do: the deviation is that of sums
+over records, each residual divided by the root of what the fit left of it, and the t-test counts how few records bear
+it. [Bell2002]
 
-A cause (order, joint levels, approach, torques, payload, temperature; steps and scales) is a set of columns: how
-residuals would move with it, to first order, along the motion of one joint, along the residual's own entries (base axes
-for a position), or along the turning of one site.
+A cause is a set of columns: how residuals would move with it, to first order, along the motion of one joint, along the
+residual's own entries (base axes for a position), or along the turning of one site.
 
 A smooth function is a sum of harmonics whose coefficients shrink as those of a smooth random function would
-[Rasmussen2006]: of each joint's angle along the joint's own motion, and of joints, pairs of them and all of them along
-the residual's entries; whatever the cause. Its odds against noise are those of its marginal likelihood; what of a
-record it predicts from the records of other poses is what is not noise.
+[Rasmussen2006], whatever the cause. Its odds against noise are those of its marginal likelihood; what of a record it
+predicts from the records of other poses is what is not noise.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -25,7 +25,7 @@ from numpy.polynomial import legendre
 from scipy.linalg import eigh
 from scipy.special import stdtr
 
-from armcal.arm.assembly import Arm, command_channels, shown_joint
+from armcal.arm.assembly import Arm, shown_joint
 from armcal.arm.effects import joint_rate
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
@@ -77,10 +77,8 @@ class Contradiction:
 
 
 def contradictions(fit: Fit) -> tuple[Contradiction, ...]:
-    """Mistakes that instruments name and that are there always.
-
-    Each parameter is judged beside all others of such mistakes, so that a lens does not pass for a bent board.
-    """
+    """Mistakes that instruments name and that are there always: each parameter beside those of all others, so that a
+    lens does not pass for a bent board."""
     if not fit.converged:
         return ()
     problem, named = fit.problem, list[tuple[Mistake, str, list[str]]]()
@@ -88,9 +86,9 @@ def contradictions(fit: Fit) -> tuple[Contradiction, ...]:
     for instance, measurement in problem.blueprint.measurements.items():
         for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
             if one.course == "always":
-                own = [problem.parameters[f"{instance}.{name}"] for name in one.parameters]
+                names = [f"{instance}.{own}" for own in one.parameters]
                 words = f"{instance}: {one.words}" if many else one.words
-                named.append((one, words, [block.name for block in own if not block.free]))
+                named.append((one, words, [name for name in names if not problem.parameters[name].free]))
     judged = _held_parameters(fit, problem, [name for *_, names in named for name in names])
     off = {name: one for name, one in judged.items() if one.p_value < MISTAKEN}
     return tuple(
@@ -117,30 +115,24 @@ def _held_parameters(fit: Fit, problem: Problem, names: Sequence[str]) -> dict[s
         return {}
     some = fit.acting.subset(thinned(np.arange(fit.acting.count), MOST_RECORDS))
     estimate, wider = fit.estimate, freed(problem, names).with_records(some.records)
-    rows, coordinates = FitRows.of(wider, estimate), wider.parameters.coordinate_names
+    rows, parameters = FitRows.of(wider, estimate), wider.parameters
     lengths = np.maximum(np.linalg.norm(rows.slopes, axis=0), 1e-300)
     left, sizes, right = np.linalg.svd(rows.slopes / lengths, full_matrices=False)
-    kept, at = sizes > _RANK * sizes[0], [coordinates.index(name) for name in names]
+    kept, at = sizes > _RANK * sizes[0], [parameters.coordinate_names.index(name) for name in names]
     basis = left[:, kept]
     sums = (right[kept].T / sizes[kept])[at] @ basis.T / lengths[at, None]
     known = np.sum(right[kept][:, at] ** 2, axis=0) > 1 - _DETERMINED
     variance, freedom = clustered_variance(rows, basis, sums, estimate.noise_scale)
-    units = wider.parameters.scales()[at]
+    units = parameters.scales()[at]
     off, sd = -sums @ rows.residual * units, np.where(known, np.sqrt(variance) * units, np.inf)
-    values = [float(estimate.values[wider.parameters.entries_of(name)][0]) for name in names]
+    values = [float(estimate.values[parameters.entries_of(name)][0]) for name in names]
     numbers = zip(names, values, off.tolist(), sd.tolist(), freedom.tolist(), strict=True)
-    return {
-        name: HeldParameter(name, problem.parameters[name].unit, value, by, deviation, spare)
-        for name, value, by, deviation, spare in numbers
-    }
+    return {name: HeldParameter(name, problem.parameters[name].unit, *own) for name, *own in numbers}
 
 
 def clustered_variance(rows: FitRows, basis: Array, sums: Array, noise_scale: float) -> tuple[Array, Array]:
-    """Variances of sums (k x rows) of a fit's rows, and their degrees of freedom (Satterthwaite's).
-
-    The fit took up an orthonormal ``basis``. No variance is less than that of independent rows; priors are as wide as
-    they state.
-    """
+    """Variances of sums (k x rows) of a fit's rows, which took up ``basis``, and their degrees of freedom
+    (Satterthwaite's): no less than of independent rows; priors are as wide as they state."""
     data = len(rows.record_of)
     whole = rows.residual - basis @ (basis.T @ rows.residual)
     own, taken = list[Array](), list[Array]()
@@ -159,10 +151,8 @@ def clustered_variance(rows: FitRows, basis: Array, sums: Array, noise_scale: fl
 
 
 def freed(problem: Problem, names: Sequence[str]) -> Problem:
-    """The problem as a function of fixed parameters too; its records serve both.
-
-    Components that, once free, read a channel that these records lack (the approach, for play held at none) stay fixed.
-    """
+    """The problem as a function of fixed parameters too; its records serve both. Components that, once free, read a
+    channel that these records lack (the approach, for play held at none) stay fixed."""
     if not names:
         return problem
     plan = problem.blueprint
@@ -208,7 +198,6 @@ MOST_LEVELS = 12  # Levels of a joint are separated one by one up to so many; be
 _SLOW = 3
 _CUBIC = 3
 _AXES = ("x", "y", "z")
-_SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _SECOND_LOAD = "repeat some poses with a second payload"
 _REPEATS = "repeat one pose at the start, in the middle and at the end"
 _STEP_MEASURE = "repeat some of the first poses now, and look at what was touched at that time"
@@ -216,45 +205,35 @@ _SURROUNDINGS = (
     ("payload", "the payload", "torsional_spring or compliance; the payload's centre", _SECOND_LOAD),
     ("temperature", "the temperature", "thermal_length", "repeat some poses cold and warm"),
 )
-_MOST_STEPS, _MOST_SLIPS = 40, 12
-"""Places at which something may have jumped are looked at: of all that is measured, and of each joint."""
+_MOST_STEPS, _MOST_SLIPS = 40, 12  # Places of jumps that are looked at: of all that is measured, and of each joint
 _FEWEST_APART = 4
-_LOAD_PARTS = (slice(0, 3), slice(3, 4), slice(4, 8))
-"""Of the loads that motion knows slopes by: turns of gravity, its size, mass and place of a payload."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One thing that residuals might depend on.
+    """One thing that residuals might depend on."""
 
-    Attributes:
-        kind: ``held``, ``order``, ``level``, ``approach``, ``coupling``, ``torque``, ``moment``, ``delay``,
-            ``payload``, ``temperature``; of what is outside of the arm ``step``, ``slip``, ``gravity``, ``load``,
-            ``scale``.
-        unit: of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares); empty if they have none.
-        jumps: whether it is a change at one place of the recording; the same change elsewhere is no other cause.
-    """
-
-    kind: str
+    kind: str  # in the arm ``held`` to ``temperature``; outside of it ``step``, ``slip``, ``gravity``, ``load``, ...
     subject: str  # the joint or site, as a user names it; empty where it is none
     words: str  # what residuals depend on, as the end of a sentence
     effect: str  # the effect that would model it, and on what; empty if there is none
     measure: str  # which measurement would show it
     columns: tuple[Array, ...]  # raw residual by coefficient, one (n_r x N x k) array a factor
     labels: tuple[str, ...] = ()  # what each coefficient is (k), for those that have a unit
-    unit: str = ""
-    jumps: bool = False
+    unit: str = ""  # of the coefficients in SI (``rad``, ``m``, ``rad_per_Nm``; ``1`` for shares)
+    jumps: bool = False  # a change at one place of the recording; the same change elsewhere is no other cause
 
 
 @dataclass(frozen=True)
 class Records:
-    """Records whose residuals are looked at, and how these move."""
+    """Records whose residuals are looked at, how these move, what was recorded of them, and functions of it."""
 
     problem: Problem
+    rows: FitRows
     dataset: Dataset
     motion: Motion
-    positions: tuple[Array, ...]  # what each factor should read of a position (3 x N; m), or nothing (0 x N)
-    moves: Moves  # by parameters that are held
+    positions: tuple[Array, ...] = ()  # what each factor should read of a position (3 x N; m), or nothing (0 x N)
+    moves: Moves = field(default_factory=dict)  # by parameters that are held
 
     @property
     def arms(self) -> Mapping[str, Arm]:
@@ -269,12 +248,10 @@ class Records:
         """How many records were recorded before each (N)."""
         return np.argsort(np.argsort(self.order, kind="stable"), kind="stable")
 
-    def shown(self, channel: str) -> str:
-        return shown_joint(channel, self.arms)
-
-    def si(self, channel: str) -> str:
+    def named(self, channel: str) -> tuple[str, str]:
+        """A joint as users know it, and the SI unit of its position."""
         arm, _, joint = channel.partition(".")
-        return "rad" if self.arms[arm].commanded[joint] == "angle" else "m"
+        return shown_joint(channel, self.arms), "rad" if self.arms[arm].commanded[joint] == "angle" else "m"
 
     def along(self, joint: str, features: Array) -> tuple[Array, ...]:
         return tuple(slope[:, :, None] * features[None] for slope in self.motion.along(joint))
@@ -294,11 +271,110 @@ class Records:
             after = (self.rank >= place)[:, None]
             yield f"whether a record was measured before or after {ids[place]}", tuple(c * after for c in columns)
 
+    @cached_property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(self._inputs())
+
+    def _inputs(self) -> Iterator[Input]:
+        def values(channel: str) -> Array | None:
+            column = self.dataset.column(channel) if self.dataset.has(channel) else None
+            return column if column is not None and np.nanmax(column) > np.nanmin(column) else None
+
+        def of(kind: str, words: str, channel: str, column: Array | None, closed: bool = False) -> Iterator[Input]:
+            if column is not None:
+                low, high = np.nanmin(column), np.nanmax(column)
+                angle = column if closed else np.pi * (column - low) / ((high - low) or 1.0)
+                yield Input(kind, words, channel, np.nan_to_num(angle))
+
+        for channel in self.motion.channels:
+            arm, _, joint = channel.partition(".")
+            shown, unit = self.named(channel)
+            yield from of("joint", f"the angle of {shown}", channel, values(channel), unit == "rad")
+            side = values(f"{arm}.approach.{joint}")
+            yield from of("approach", f"the side {shown} was approached from", channel, side)
+        yield from of("time", "time", "", self.order)
+        for kind in ("payload", "temperature"):
+            yield from of(kind, f"the {kind}", "", values(kind))
+
+    def functions(self, used: Sequence[int]) -> Functions:
+        features = np.hstack([self._features(self.inputs[i]) for i in used])
+        along = [self._along(self.inputs[i]) for i in used if self.inputs[i].channel]
+        return Functions(np.hstack([*along, self._by_entry(features)]), features)
+
+    @cached_property
+    def of_time(self) -> tuple[Functions, ...]:
+        return (self.functions([i for i, own in enumerate(self.inputs) if own.kind == "time"]),)
+
+    @cached_property
+    def of_pose(self) -> tuple[Functions, ...]:
+        """Of all inputs but time together, with pairs of joints and all joints; of near poses; of each input alone."""
+        joints = [own for own in self.inputs if own.kind == "joint"]
+        features = [self._features(own) for own in self.inputs if own.kind != "time"]
+        for one, other in combinations(joints, 2):
+            if one.channel.partition(".")[0] == other.channel.partition(".")[0]:
+                first, second = (_harmonics(own.angle, 1) for own in (one, other))
+                features.append(np.einsum("nk,nl->nkl", first, second).reshape(len(first), -1) / 2)
+        chords = np.sum([(2 * np.sin((j.angle[:, None] - j.angle) / 2)) ** 2 for j in joints], axis=0)
+        near, far = (np.exp(-chords / (2 * length**2)) for length in _POSE_LENGTHS)
+        whole = np.hstack([np.zeros((len(chords), 0)), *features])
+        smooth = self._of_kernel(whole @ whole.T + far)
+        together = replace(smooth, columns=np.hstack([self.of_joints.columns, smooth.columns]))
+        alone = [self.functions([i]) for i, own in enumerate(self.inputs) if own.kind != "time"]
+        return (together, self._of_kernel(near), *alone)
+
+    def _of_kernel(self, kernel: Array) -> Functions:
+        values, vectors = eigh(kernel)
+        most = max(1, _MOST_ENTRIES // self.rows.by_record.shape[1])
+        kept = np.flatnonzero(values > _SMALLEST * values[-1])[::-1][:most]
+        features = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+        return Functions(self._by_entry(features), features)
+
+    @cached_property
+    def of_joints(self) -> Functions:
+        """Of each joint's own angle and the side it came from, along its own motion."""
+        none = np.zeros((len(self.rows.residual), 0))
+        along = np.hstack([none, *(self._along(own) for own in self.inputs if own.channel)])
+        return Functions(along, np.zeros((len(self.rows.by_record), 0)))
+
+    def _features(self, own: Input) -> Array:
+        return _harmonics(own.angle, self._highest(_FINE) if own.kind == "time" else _COARSE)
+
+    def _highest(self, most: int) -> int:
+        return min(most, max(_COARSE, len(self.rows.by_record) // _RECORDS_PER_HARMONIC))
+
+    @cached_property
+    def _moved(self) -> Mapping[str, Array]:
+        """The data's rows by the motion of each joint, of size 1 over all joints."""
+        raw = {one: [slope[:, :, None] for slope in self.motion.along(one)] for one in self.motion.channels}
+        moved = {one: self.rows.columns(of)[: len(self.rows.record_of), 0] for one, of in raw.items()}
+        of_all = np.mean([np.mean(own**2) for own in moved.values()])
+        return {one: own / (np.sqrt(of_all) or 1.0) for one, own in moved.items()}
+
+    def _along(self, own: Input) -> Array:
+        most = min(_FINE, _MOST_ALONG // (2 * len(self.motion.channels))) if own.kind == "joint" else _COARSE
+        moved, features = self._moved[own.channel], _harmonics(own.angle, self._highest(most))
+        columns = np.zeros((len(self.rows.residual), features.shape[1]))
+        columns[: len(moved)] = moved[:, None] * features[self.rows.record_of]
+        return columns
+
+    def _by_entry(self, features: Array) -> Array:
+        """Functions of each entry of a record's residual for itself; none of an entry that did not take part."""
+        by_record, size = self.rows.by_record, features.shape[1]
+        whitening = self.rows.whitening
+        acting = np.abs(self.rows.columns([np.ones((len(w), w.shape[2], 1)) for w in whitening])[:, 0]) > 0
+        columns = np.zeros((len(self.rows.residual), size * by_record.shape[1]))
+        for entry, own in enumerate(by_record.T):
+            columns[own, entry * size : (entry + 1) * size] = features * acting[own, None]
+        return columns
+
 
 def causes_of(here: Records) -> Iterator[Cause]:
-    """Causes in the arm, then outside of it."""
-    dataset = here.dataset
-    yield from _of_held(here)
+    dataset, parameters = here.dataset, here.problem.parameters
+    for name in filter(here.moves.__contains__, candidates(parameters)):
+        block, measure = parameters[name], "armcal identify --fixed, which judges it on records held out"
+        labels, unit = (("off by",), block.unit) if block.domain.dof == 1 else ((), "")
+        effect = f"free {name} (parameters.free)"
+        yield Cause("held", name, f"{name}, which is held", effect, measure, here.moves[name], labels, unit)
     yield from _of_order(here)
     for name, arm in here.arms.items():
         for joint in arm.commanded:
@@ -320,15 +396,6 @@ def causes_of(here: Records) -> Iterator[Cause]:
     yield from _of_steps(here)
 
 
-def _of_held(here: Records) -> Iterator[Cause]:
-    parameters = here.problem.parameters
-    for name in filter(here.moves.__contains__, candidates(parameters)):
-        block, measure = parameters[name], "armcal identify --fixed, which judges it on records held out"
-        labels, unit = (("off by",), block.unit) if block.domain.dof == 1 else ((), "")
-        effect = f"free {name} (parameters.free)"
-        yield Cause("held", name, f"{name}, which is held", effect, measure, here.moves[name], labels, unit)
-
-
 def _of_order(here: Records) -> Iterator[Cause]:
     order = here.order
     if np.ptp(order) <= 0:
@@ -344,8 +411,8 @@ def _of_order(here: Records) -> Iterator[Cause]:
 
 
 def _of_level(here: Records, channel: str) -> Iterator[Cause]:
-    command, shown, si = here.dataset.column(channel), here.shown(channel), here.si(channel)
-    levels, labels = np.unique(np.round(_stated(command), 9)), tuple[str, ...]()
+    command, (shown, si) = here.dataset.column(channel), here.named(channel)
+    levels, labels = np.unique(np.round(command[np.isfinite(command)], 9)), tuple[str, ...]()
     if len(levels) < 2:
         return
     if len(levels) <= MOST_LEVELS:
@@ -356,10 +423,10 @@ def _of_level(here: Records, channel: str) -> Iterator[Cause]:
         middle, half = (levels[0] + levels[-1]) / 2, (levels[-1] - levels[0]) / 2
         features = legendre.legvander((command - middle) / half, _CUBIC)[:, 1:]
     features = _centred(features, command)
-    effect = f"{'' if len(levels) <= _CUBIC else 'gear_error or '}servo_map on {shown}"
-    measure = f"command {shown} to levels in between, from both sides"
     what, itself = ("angle", "its own motion") if si == "rad" else ("travel", "itself")
     words = f"the {what} of {shown}, along {itself}"
+    effect = f"{'' if len(levels) <= _CUBIC else 'gear_error or '}servo_map on {shown}"
+    measure = f"command {shown} to levels in between, from both sides"
     yield Cause("level", shown, words, effect, measure, here.along(channel, features), labels, si)
     words = f"the {what} of {shown}, in directions that {shown} does not move"
     effect = f"more free geometry about {shown}, or compliance there"
@@ -369,7 +436,7 @@ def _of_level(here: Records, channel: str) -> Iterator[Cause]:
 
 def _of_approach(here: Records, channel: str) -> Iterator[Cause]:
     arm, _, joint = channel.partition(".")
-    shown, side = here.shown(channel), f"{arm}.approach.{joint}"
+    (shown, si), side = here.named(channel), f"{arm}.approach.{joint}"
     effect, words = f"approach_backlash on {shown}", f"the side {shown} was approached from"
     if here.dataset.has(side):
         came = here.dataset.column(side)
@@ -379,31 +446,29 @@ def _of_approach(here: Records, channel: str) -> Iterator[Cause]:
         came = moved[np.maximum.accumulate(np.where(moved != 0, np.arange(len(moved)), 0))][here.rank]
         effect += ", with a column for the approach"
         words += ", if it went from pose to pose in the recorded order"
-    if _spread(came) <= 0:
-        return
-    sign, measure = np.nan_to_num(-came[:, None]), f"visit the same poses from both sides of {shown}"
-    columns, labels = here.along(channel, sign), ("half of its play",)
-    yield Cause("approach", shown, f"{words}, along its own motion", effect, measure, columns, labels, here.si(channel))
-    words += f", in directions that {shown} does not move"
-    yield Cause("approach", shown, words, "", measure, here.axes(sign))
+    if _spread(came) > 0:
+        sign, measure = np.nan_to_num(-came[:, None]), f"visit the same poses from both sides of {shown}"
+        columns, labels = here.along(channel, sign), ("half of its play",)
+        yield Cause("approach", shown, f"{words}, along its own motion", effect, measure, columns, labels, si)
+        words += f", in directions that {shown} does not move"
+        yield Cause("approach", shown, words, "", measure, here.axes(sign))
 
 
 def _of_coupling(here: Records, channel: str, arm: Arm) -> Iterator[Cause]:
-    joint, shown = channel.partition(".")[2], here.shown(channel)
+    joint, shown = channel.partition(".")[2], here.named(channel)[0]
     for other, dimension in arm.commanded.items():
         command = here.dataset.column(f"{arm.name}.{other}")
-        if other == joint or dimension != arm.commanded[joint] or _spread(command) <= 0:
-            continue
-        words = f"the command of {other}, along {shown}'s own motion: {other} moves {shown} with it"
-        measure = f"move {other} alone from end to end, and watch {shown}"
-        columns = here.along(channel, _centred(np.nan_to_num(command)[:, None], command))
-        yield Cause("coupling", f"{other} on {shown}", words, "", measure, columns, ("share",), "1")
+        if other != joint and dimension == arm.commanded[joint] and _spread(command) > 0:
+            words = f"the command of {other}, along {shown}'s own motion: {other} moves {shown} with it"
+            measure = f"move {other} alone from end to end, and watch {shown}"
+            columns = here.along(channel, _centred(np.nan_to_num(command)[:, None], command))
+            yield Cause("coupling", f"{other} on {shown}", words, "", measure, columns, ("share",), "1")
 
 
 def _of_torque(here: Records, channel: str, effort: Array) -> Iterator[Cause]:
-    if _spread(effort) <= 1e-9 * max(1.0, float(np.abs(_stated(effort)).max(initial=0.0))):
+    if _spread(effort) <= 1e-9 * max(1.0, float(np.nanmax(np.abs(effort), initial=0.0))):
         return
-    effort, shown, si = np.nan_to_num(effort), here.shown(channel), here.si(channel)
+    effort, (shown, si) = np.nan_to_num(effort), here.named(channel)
     load, per, cubic = ("torque about", "rad_per_Nm", "rad_per_Nm3") if si == "rad" else ("force along", "", "")
     both = f"poses on both sides of zero {load.split()[0]} at {shown}, some with a second payload"
     laws = (
@@ -420,33 +485,29 @@ def _of_torque(here: Records, channel: str, effort: Array) -> Iterator[Cause]:
 
 def _of_moments(here: Records, arm: Arm) -> Iterator[Cause]:
     """A symmetric compliance at each site, seen by the factors that measure this arm's tip in its base frame."""
-    seen = [
-        [channel.rpartition(".")[2] for channel in factor.output_channels] == list(_AXES)
-        and tuple(here.problem.blueprint.measurements[factor.name].arms) == (arm.name,)
-        for factor in (kernel.factor for kernel in here.problem.kernels)
-    ]
-    loads, alone = here.motion.loads[arm.name], len(here.arms) == 1
+    seen, measurements = [], here.problem.blueprint.measurements
+    for factor in (kernel.factor for kernel in here.problem.kernels):
+        tip = [channel.rpartition(".")[2] for channel in factor.output_channels] == list(_AXES)
+        seen.append(tip and tuple(measurements[factor.name].arms) == (arm.name,))
+    loads = here.motion.loads[arm.name]
     for site, (moment, lever) in enumerate(zip(loads.moments, loads.levers, strict=True)):
-        moved = []
-        for j, k in _SYMMETRIC:
-            one = lever[:, j] * moment[k]
-            moved.append(one if j == k else one + lever[:, k] * moment[j])
-        tip = np.nan_to_num(np.stack(moved, axis=2))
-        if not any(seen) or not np.any(tip):
+        pairs = [(j, k) for j in range(3) for k in range(j, 3)]
+        moved = [lever[:, j] * moment[k] + (lever[:, k] * moment[j] if j != k else 0) for j, k in pairs]
+        turned = np.nan_to_num(np.stack(moved, axis=2))
+        if not any(seen) or not np.any(turned):
             continue
         sizes = (slope.shape[0] for slope in here.motion.slopes)
-        columns = tuple(tip if yes else np.zeros((n, *tip.shape[1:])) for yes, n in zip(seen, sizes, strict=True))
+        columns = tuple(turned if yes else np.zeros((n, *turned.shape[1:])) for yes, n in zip(seen, sizes, strict=True))
         name = arm.joint_names[site - 1] if site else "the mount"
-        shown = name if alone else (f"{arm.name}.{name}" if site else f"the mount of {arm.name}")
-        words = f"the moment that {shown} carries, in all directions"
-        yield Cause("moment", shown, words, f"compliance on {shown}", _SECOND_LOAD, columns)
+        if len(here.arms) > 1:
+            name = f"{arm.name}.{name}" if site else f"the mount of {arm.name}"
+        words = f"the moment that {name} carries, in all directions"
+        yield Cause("moment", name, words, f"compliance on {name}", _SECOND_LOAD, columns)
 
 
 def _of_rates(here: Records, arm: Arm) -> Iterator[Cause]:
-    """Joints read before or after the measurement, which moved in between: to first order in that time.
-
-    Beside it the play of all joints at once, which a delay resembles where each moved about as fast, to and fro.
-    """
+    """Joints read before or after the measurement, which moved in between, to first order in that time; and the play of
+    all joints at once, which a delay resembles where each moved about as fast, to and fro."""
     names = {joint: joint_rate(joint).name for joint in arm.commanded}
     shared = any(not names.keys().isdisjoint(other.commanded) for other in here.arms.values() if other is not arm)
     if shared or not all(map(here.dataset.has, names.values())):
@@ -467,7 +528,6 @@ def _of_rates(here: Records, arm: Arm) -> Iterator[Cause]:
 
 
 def _of_mistakes(here: Records) -> Iterator[Cause]:
-    """Mistakes with an instrument that come slowly, or once."""
     parameters, measurements = here.problem.parameters, here.problem.blueprint.measurements
     for name, measurement in measurements.items():
         for one in measurement.mistakes() if isinstance(measurement, NamesMistakes) else ():
@@ -489,12 +549,13 @@ def _of_mistakes(here: Records) -> Iterator[Cause]:
 
 
 def _of_loads(here: Records) -> Iterator[Cause]:
-    if here.motion.by_load:
+    if here.motion.by_load:  # slopes by turns of gravity, its size, mass and place of a payload
         by_load = [slope.transpose(0, 2, 1) for slope in here.motion.by_load]  # n_r x N x (gravity's turn, size, load)
+        gravity, size, load = (
+            tuple(slope[:, :, part] for slope in by_load) for part in (slice(0, 3), slice(3, 4), slice(4, 8))
+        )
         level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
-        weigh = "weigh what hangs on the tool"
-        turns = tuple(f"turned about {axis}" for axis in _AXES)
-        gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in _LOAD_PARTS)
+        weigh, turns = "weigh what hangs on the tool", tuple(f"turned about {axis}" for axis in _AXES)
         words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
         yield Cause("gravity", "", words, effect, level, gravity, turns, "rad")
         words = "the size of gravity, or of all masses together"
@@ -503,20 +564,17 @@ def _of_loads(here: Records) -> Iterator[Cause]:
 
 
 def _of_instrument(here: Records) -> Iterator[Cause]:
+    """What is read along one axis grows with the coordinate on another."""
     if not any(np.any(position) for position in here.positions):
         return
-    sizes, known = (
-        [s.shape[0] for s in here.motion.slopes],
-        "measure a known length along each axis with the instrument",
-    )
+    known = "measure a known length along each axis with the instrument"
 
     def columns(*entries: tuple[int, int]) -> tuple[Array, ...]:
-        """What is read along one axis grows with the coordinate on another: one column for each such pair."""
-        parts = [np.zeros((size, len(here.dataset), len(entries))) for size in sizes]
+        parts = tuple(np.zeros((s.shape[0], len(here.dataset), len(entries))) for s in here.motion.slopes)
         for part, own in zip(parts, here.positions, strict=True):
             for k, (row, other) in enumerate(entries if len(own) else ()):
                 part[row, :, k] = -own[other]
-        return tuple(parts)
+        return parts
 
     together = tuple(np.sum(part, axis=2, keepdims=True) for part in columns((0, 0), (1, 1), (2, 2)))
     words = "the instrument's scale, along all axes alike"
@@ -543,17 +601,14 @@ def _of_steps(here: Records) -> Iterator[Cause]:
         for when, jump in here.jumps(columns, _MOST_STEPS):
             yield Cause("step", "", f"{when}: {words}", effect, _STEP_MEASURE, jump, jumps=True)
     for channel in here.motion.channels:
-        shown, si = here.shown(channel), here.si(channel)
+        shown, si = here.named(channel)
         for when, slip in here.jumps(here.along(channel, once), _MOST_SLIPS):
-            words = f"{when}: {shown} slips there"
-            yield Cause("slip", shown, words, "", _STEP_MEASURE, slip, ("slip",), si, jumps=True)
+            yield Cause("slip", shown, f"{when}: {shown} slips there", "", _STEP_MEASURE, slip, ("slip",), si, True)
 
 
 def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
     """What each factor should read of a position (3 x N; m), 0 where it reads none; nothing (0 x N) of other factors.
-
-    Not what it does read: the noise of that would be taken for a scale.
-    """
+    Not what it does read: the noise of that would be taken for a scale."""
     positions = []
     for kernel, off in zip(problem.kernels, problem.residuals(values), strict=True):
         channels = kernel.factor.position_channels
@@ -562,37 +617,28 @@ def predicted_positions(problem: Problem, values: Array, dataset: Dataset) -> tu
     return tuple(positions)
 
 
-def _stated(feature: Array) -> Array:
-    """Without the records that do not have it: those of another arm."""
-    return feature[np.isfinite(feature)]
-
-
 def _spread(feature: Array) -> float:
-    """From the smallest to the largest; 0 where no record has it."""
-    stated = _stated(feature)
+    """From the smallest to the largest; 0 where no record has it, as those of another arm have not."""
+    stated = feature[np.isfinite(feature)]
     return float(np.ptp(stated)) if len(stated) else 0.0
 
 
 def _centred(features: Array, command: Array) -> Array:
     """About their mean (N x k) in the records that state the command, none in the others."""
-    known = np.isfinite(command)
-    centred = np.zeros_like(features)
-    centred[known] = features[known] - features[known].mean(axis=0)
-    return centred
+    known = np.isfinite(command)[:, None]
+    return np.asarray(np.where(known, features - features.mean(axis=0, where=known, keepdims=True), 0.0))
 
 
 def scatter_features(here: Records) -> Iterator[tuple[str, Array]]:
-    """On what the scatter may depend, in words; of the positions those of the first instrument that reads some."""
+    """On what the scatter may depend; of the positions those of the first instrument that reads some."""
     yield "the recorded order", here.order
-    place = next((own for own in here.positions if len(own)), np.zeros((0, len(here.dataset))))
-    for axis, coordinate in zip(_AXES, place, strict=False):
-        yield f"the coordinate {axis}", coordinate
-    if len(place):
+    if (place := next((own for own in here.positions if len(own)), None)) is not None:
+        yield from ((f"the coordinate {axis}", coordinate) for axis, coordinate in zip(_AXES, place, strict=True))
         yield "the distance from the instrument", np.linalg.norm(place, axis=0)
     for channel in here.motion.channels:
         joint, command = channel.rpartition(".")[2], np.nan_to_num(here.dataset.column(channel))
-        yield f"the command of {joint}", command
         middle = (command.min() + command.max()) / 2
+        yield f"the command of {joint}", command
         yield f"how far {joint} is from the middle of its commands", np.abs(command - middle)
     for loads in here.motion.loads.values():
         for number, effort in enumerate(loads.efforts, start=1):
@@ -614,26 +660,17 @@ class Input:
     """What was recorded: a joint, the side it was approached from, time, payload or temperature."""
 
     kind: str  # ``joint``, ``approach``, ``time``, ``payload`` or ``temperature``
-    name: str  # of the joint, with its arm where there are several; empty where it is none
-    channel: str
-    angle: Array  # On a circle, or on half of one where it does not close (N; rad)
-
-    @property
-    def words(self) -> str:
-        of = {"joint": f"the angle of {self.name}", "approach": f"the side {self.name} was approached from"}
-        return of.get(self.kind, f"the {self.kind}" if self.kind != "time" else "time")
+    words: str
+    channel: str  # of the joint; empty where it is none
+    angle: Array  # on a circle, or on half of one where it does not close (N; rad)
 
 
 @dataclass(frozen=True)
 class Functions:
-    """Functions of some inputs: columns whose coefficients are alike in size (rows x k).
+    """Functions of some inputs, whose coefficients are alike in size."""
 
-    Attributes:
-        features: the same of each record, whichever entry they move (N x r).
-    """
-
-    columns: Array
-    features: Array
+    columns: Array  # (rows x k)
+    features: Array  # the same of each record, whichever entry they move (N x r)
 
     def imitate(self, function: Array) -> float:
         """Which share of a function (N x n_r) they predict of a record from the others."""
@@ -654,7 +691,7 @@ class Smooth:
     parts: tuple[tuple[Array, Array], ...]  # an orthonormal basis of each (rows x m), and how large it is along it (m)
 
     @classmethod
-    def of(cls, functions: Sequence[Functions], basis: Array) -> "Smooth":
+    def of(cls, functions: Sequence[Functions], basis: Array) -> Smooth:
         parts = []
         for one in functions:
             columns = one.columns - basis @ (basis.T @ one.columns)
@@ -669,13 +706,11 @@ class Smooth:
 
     def evidence(self, residual: Array) -> float:
         """The logarithm of the odds in one residual (rows), the choice of a ratio paid for."""
-        return float(self.gains(residual[:, None])[0] - np.log(self._freedom))
+        return float(self.gains(residual[:, None])[0] - np.log(len(self.basis) - self.basis.shape[1]))
 
     def predicted(self, residual: Array, groups: Sequence[Indices]) -> tuple[Array, float]:
-        """The likeliest function in a residual (rows), and which share of squares it predicts.
-
-        Of each group of rows by the others, as compared with the fit alone; wild ones are bounded.
-        """
+        """The likeliest function in a residual (rows), and which share of squares it predicts: of each group of rows by
+        the others, as compared with the fit alone; wild ones are bounded."""
         gains = [self._by_ratio(*part, residual[:, None])[:, 0] for part in self.parts]
         best = int(np.argmax([own.max() for own in gains]))
         (axes, sizes), ratio = self.parts[best], _RATIOS[int(np.argmax(gains[best]))]
@@ -690,140 +725,18 @@ class Smooth:
         with_it, without = np.sum(bounded**2, axis=1)
         return function, float(1 - with_it / max(without, 1e-300))
 
-    @property
-    def _freedom(self) -> int:
-        return int(len(self.basis) - self.basis.shape[1])
-
     def _by_ratio(self, axes: Array, sizes: Array, residuals: Array) -> Array:
         total = np.maximum(np.sum(residuals**2, axis=0), 1e-300)
         taken = _RATIOS[:, None] * sizes / (1 + _RATIOS[:, None] * sizes)
         left = np.maximum(total - taken @ (axes.T @ residuals) ** 2, 1e-12 * total)
         penalty = np.sum(np.log1p(_RATIOS[:, None] * sizes), axis=1)[:, None]
-        return np.asarray(-0.5 * (self._freedom * np.log(left / total) + penalty))
+        freedom = len(self.basis) - self.basis.shape[1]
+        return np.asarray(-0.5 * (freedom * np.log(left / total) + penalty))
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """What was recorded of some records, and functions of it."""
-
-    rows: FitRows
-    motion: Motion
-    inputs: tuple[Input, ...]
-
-    @classmethod
-    def of(cls, problem: Problem, rows: FitRows, motion: Motion, dataset: Dataset) -> "Recorded":
-        return cls(rows, motion, tuple(_inputs(problem, motion, dataset)))
-
-    @property
-    def time(self) -> int:
-        """Which of the inputs."""
-        return next(i for i, own in enumerate(self.inputs) if own.kind == "time")
-
-    def functions(self, used: Sequence[int]) -> Functions:
-        """Of some inputs, each for itself."""
-        features = np.hstack([self._features(self.inputs[i]) for i in used])
-        along = [self._along(self.inputs[i]) for i in used if self.inputs[i].channel]
-        return Functions(np.hstack([*along, self._by_entry(features)]), features)
-
-    @cached_property
-    def of_time(self) -> tuple[Functions, ...]:
-        return (self.functions([self.time]),)
-
-    @cached_property
-    def of_pose(self) -> tuple[Functions, ...]:
-        """Of all inputs but time together, with pairs of joints and all joints; of near poses; of each input alone."""
-        joints = [own for own in self.inputs if own.kind == "joint"]
-        features = [self._features(own) for i, own in enumerate(self.inputs) if i != self.time]
-        for one, other in combinations(joints, 2):
-            if one.channel.partition(".")[0] == other.channel.partition(".")[0]:
-                first, second = (_harmonics(own.angle, 1)[0] for own in (one, other))
-                features.append(np.einsum("nk,nl->nkl", first, second).reshape(len(first), -1) / 2)
-        chords = np.sum([(2 * np.sin((j.angle[:, None] - j.angle) / 2)) ** 2 for j in joints], axis=0)
-        near, far = (np.exp(-chords / (2 * length**2)) for length in _POSE_LENGTHS)
-        whole = np.hstack([np.zeros((len(chords), 0)), *features])
-        smooth = self._of_kernel(whole @ whole.T + far)
-        together = replace(smooth, columns=np.hstack([self.of_joints.columns, smooth.columns]))
-        alone = [self.functions([i]) for i in range(len(self.inputs)) if i != self.time]
-        return (together, self._of_kernel(near), *alone)
-
-    def _of_kernel(self, kernel: Array) -> Functions:
-        """Functions of the records that correlate so (N x N), the smoothest ones."""
-        values, vectors = eigh(kernel)
-        most = max(1, _MOST_ENTRIES // self.rows.by_record.shape[1])
-        kept = np.flatnonzero(values > _SMALLEST * values[-1])[::-1][:most]
-        features = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
-        return Functions(self._by_entry(features), features)
-
-    @cached_property
-    def of_joints(self) -> Functions:
-        """Of each joint's own angle and the side it came from, along its own motion."""
-        none = np.zeros((len(self.rows.residual), 0))
-        along = np.hstack([none, *(self._along(own) for own in self.inputs if own.channel)])
-        return Functions(along, np.zeros((len(self.rows.by_record), 0)))
-
-    def _features(self, own: Input) -> Array:
-        """Harmonics of one input (N x r): the variance of one falls as 1/order, as if any length were as likely."""
-        return _weighted(own.angle, self._highest(_FINE) if own.kind == "time" else _COARSE)
-
-    def _highest(self, most: int) -> int:
-        return min(most, max(_COARSE, len(self.rows.by_record) // _RECORDS_PER_HARMONIC))
-
-    def _along(self, own: Input) -> Array:
-        """Of one joint, along its own motion (rows x k)."""
-        of_all = np.mean([np.mean(self._moved(one) ** 2) for one in self.motion.channels])
-        most = min(_FINE, _MOST_ALONG // (2 * len(self.motion.channels))) if own.kind == "joint" else _COARSE
-        moved = self._moved(own.channel) / (np.sqrt(of_all) or 1.0)
-        features = _weighted(own.angle, self._highest(most))
-        columns = np.zeros((len(self.rows.residual), features.shape[1]))
-        columns[: len(moved)] = moved[:, None] * features[self.rows.record_of]
-        return columns
-
-    def _moved(self, channel: str) -> Array:
-        moved = self.rows.columns([slope[:, :, None] for slope in self.motion.along(channel)])
-        return np.asarray(moved[: len(self.rows.record_of), 0])
-
-    def _by_entry(self, features: Array) -> Array:
-        """Functions of each entry of a record's residual for itself; none of an entry that did not take part."""
-        by_record, size = self.rows.by_record, features.shape[1]
-        whitening = self.rows.whitening
-        acting = np.abs(self.rows.columns([np.ones((len(w), w.shape[2], 1)) for w in whitening])[:, 0]) > 0
-        columns = np.zeros((len(self.rows.residual), size * by_record.shape[1]))
-        for entry, own in enumerate(by_record.T):
-            columns[own, entry * size : (entry + 1) * size] = features * acting[own, None]
-        return columns
-
-
-def _inputs(problem: Problem, motion: Motion, dataset: Dataset) -> Iterator[Input]:
-    def on_circle(values: Array, closed: bool = False) -> Array:
-        low, high = np.nanmin(values), np.nanmax(values)
-        return np.nan_to_num(values if closed else np.pi * (values - low) / (high - low))
-
-    def varies(channel: str) -> bool:
-        return dataset.has(channel) and bool(np.nanmax(dataset.column(channel)) > np.nanmin(dataset.column(channel)))
-
-    arms, dimensions = problem.blueprint.arms, command_channels(problem.blueprint.arms)
-    for channel in motion.channels:
-        arm, _, joint = channel.partition(".")
-        shown, side = shown_joint(channel, arms), f"{arm}.approach.{joint}"
-        if varies(channel):
-            yield Input("joint", shown, channel, on_circle(dataset.column(channel), dimensions[channel] == "angle"))
-        if varies(side):
-            yield Input("approach", shown, channel, on_circle(dataset.column(side)))
-    order = recorded_order(dataset)
-    yield Input("time", "", "", on_circle(order) if np.ptp(order) > 0 else np.zeros(len(order)))
-    for kind in ("payload", "temperature"):
-        if varies(kind):
-            yield Input(kind, "", "", on_circle(dataset.column(kind)))
-
-
-def _harmonics(angle: Array, highest: int) -> tuple[Array, Array]:
-    """Cosines and sines of multiples of an angle (N x 2 highest), and which multiples."""
-    highest = max(1, min(highest, len(np.unique(np.round(angle, 9))) - 1))
-    order = np.arange(1, highest + 1)
+def _harmonics(angle: Array, highest: int) -> Array:
+    """Cosines and sines of multiples of an angle: the variance of one falls as 1/order, as if any length were as
+    likely."""
+    order = np.arange(1, 1 + max(1, min(highest, len(np.unique(np.round(angle, 9))) - 1)))
     turned = angle[:, None] * order
-    return np.hstack([np.cos(turned), np.sin(turned)]), np.tile(order, 2).astype(float)
-
-
-def _weighted(angle: Array, highest: int) -> Array:
-    harmonics, order = _harmonics(angle, highest)
-    return np.asarray(harmonics * np.sqrt(1 / (order * np.sum(1 / np.unique(order)))))
+    return np.asarray(np.hstack([np.cos(turned), np.sin(turned)]) * np.sqrt(1 / np.tile(order * np.sum(1 / order), 2)))

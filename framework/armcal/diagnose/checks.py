@@ -12,8 +12,8 @@ from typing import Any, Literal, Protocol
 from armcal.plugins import PluginRegistry, said
 
 Grade = Literal["good", "note", "warning", "bad"]
-EXACT, NOTES, NO_RATE = "exact", "notes only", "no rate yet"
-"""Of a check that states a fact and tests nothing, that never warns, or whose false alarms were not counted.
+EXACT, NO_RATE = "exact", "no rate yet"
+"""Of a check that states a fact and tests nothing, or whose false alarms were not counted.
 
 A level, ``0.5 %``, is what a test allows: all levels add up to 5 %, but that of a held scale, on which every length
 rests. A count, ``0 of 1,200``, is of how many sound recordings, of six kinds of instrument, the check warned."""
@@ -52,8 +52,8 @@ class Check:
     name: str
     question: str  # that it answers
     rate: str  # of false alarms: the level stated for sound data, ``EXACT`` or ``NO_RATE``
-    page: str  # of the documentation
     target: str  # module:function; of armcal's own below ``armcal.diagnose``
+    page: str = "numbers.md"  # of the documentation
     plugin: str = ""  # that registered it; empty for armcal's own
 
     def findings(self, subject: Any) -> list[Finding]:
@@ -71,69 +71,61 @@ class Check:
 
 DATA_CHECKS = (
     Check("axes", "Would the data fit far better with axes or joints exchanged, reversed or coupled?", "0 of 1,200",
-          "troubleshooting.md", "data:mixed_up"),
-    Check("reach", "Are all positions in one unit, and as far out as the arm reaches?", "0 of 1,200", "data.md",
-          "data:reach"),
-    Check("masses", "Does the arm weigh what an arm of its length may weigh?", "0 of 1,200", "models.md",
-          "data:masses"),
+          "data:mixed_up", "troubleshooting.md"),
+    Check("reach", "Are all positions in one unit, and as far out as the arm reaches?", "0 of 1,200", "data:reach",
+          "data.md"),
+    Check("masses", "Does the arm weigh what an arm of its length may weigh?", "0 of 1,200", "data:masses",
+          "models.md"),
     Check("gravity", "Where springs bend: is gravity stated, in the frame of the measurements?", "0 of 1,200",
-          "calibrate.md", "data:gravity"),
+          "data:gravity", "calibrate.md"),
 )  # fmt: skip
 """Of data before a fit."""
 
 FIT_CHECKS = (
-    Check("converged", "Did the solver converge?", EXACT, "numbers.md", "verdict:converged"),
+    Check("converged", "Did the solver converge?", EXACT, "verdict:converged"),
     Check("before", "What did the checks of the data find, and what became of a pose residual?", EXACT,
-          "pose_residual.md", "verdict:found_before"),
+          "verdict:found_before", "pose_residual.md"),
     Check("determined", "Do the data determine all free parameters, and does the tip depend on the others?", EXACT,
-          "identifiability.md", "unseen:determined"),
-    Check("condition", "Is a combination of parameters hardly determined?", EXACT, "identifiability.md",
-          "verdict:conditioned"),
-    Check("bounds", "Do the data push against a bound?", "0.5 %", "numbers.md", "verdict:bounds"),
-    Check("shifts", "Do bounds that hold shift other estimates?", EXACT, "numbers.md", "verdict:shifts"),
-    Check("noise", "Are residuals as large as the declared noise, and whose are they?", "0.5 %", "noise.md",
-          "verdict:noise"),
-    Check("freedom", "Are equations left beside the free parameters?", EXACT, "numbers.md", "verdict:freedom"),
+          "verdict:determined", "identifiability.md"),
+    Check("condition", "Is a combination of parameters hardly determined?", EXACT, "verdict:conditioned",
+          "identifiability.md"),
+    Check("bounds", "Do the data push against a bound?", "0.5 %", "verdict:bounds"),
+    Check("shifts", "Do bounds that hold shift other estimates?", EXACT, "verdict:shifts"),
+    Check("noise", "Are residuals as large as the declared noise, and whose are they?", "0.5 %", "verdict:noise",
+          "noise.md"),
+    Check("freedom", "Are equations left beside the free parameters?", EXACT, "verdict:freedom"),
     Check("instruments", "Do records contradict what an instrument holds: a board's size, a lens?", "0.1 %",
-          "board.md", "causes:instruments"),
-    Check("rounding", "Were recorded joint angles rounded?", "0 of 1,200", "data.md", "unseen:rounded"),
-    Check("structure", "What do residuals still depend on, and what does their scatter?", "1 %", "mathematics.md",
-          "residual_structure:depends"),
-    Check("repeats", "Do repeats of a pose scatter as much as residuals?", "0.5 %", "numbers.md",
-          "residual_structure:repeated"),
+          "causes:instruments", "board.md"),
+    Check("rounding", "Were recorded joint angles rounded?", "0 of 1,200", "gross:rounded", "data.md"),
+    Check("structure", "What do residuals still depend on, and what does their scatter?", "1 %",
+          "residual_structure:depends", "mathematics.md"),
+    Check("repeats", "Do repeats of a pose scatter as much as residuals?", "0.5 %", "residual_structure:repeated"),
     Check("neighbours", "Do records that follow one another miss alike, and how much wider are intervals?", EXACT,
-          "mathematics.md", "residual_structure:neighbours"),
-    Check("correlated", "Which estimates correlate strongly?", EXACT, "identifiability.md", "verdict:correlated"),
-    Check("computed", "Do the tips come from the joints, not from an instrument?", "0 of 1,200", "data.md",
-          "gross:computed"),
-    Check("gross", "Is the error gross beside the arm's reach?", "0 of 1,200", "numbers.md", "gross:gross"),
-    Check("jump", "Do the records contradict one another from one place on?", "0 of 1,200", "numbers.md",
-          "gross:jumped"),
-    Check("minority", "Do many records contradict the others?", "0 of 1,200", "numbers.md", "outliers:contradicting"),
-    Check("size", "Is the calibrated arm as large as the nominal one?", "0.4 %", "numbers.md", "gross:size"),
-    Check("displaced", "Is a parameter far from its prior or its nominal value?", "0 of 1,200", "numbers.md",
-          "gross:displaced"),
-    Check("scale", "Which error of an instrument's scale would not show?", "5 %", "trackers.md", "unseen:scale"),
-    Check("payload", "Which payload would not show?", EXACT, "effects.md", "unseen:payload"),
-    Check("elsewhere", "How well is the tool known away from the contacts?", EXACT, "ball_and_sockets.md",
-          "unseen:away"),
-    Check("worse", "Are unseen records missed by more than by the nominal arm?", "0.5 %", "numbers.md",
-          "gross:worse"),
-    Check("turns", "Are orientations grossly off, or worse than the nominal arm's?", "0 of 1,200", "numbers.md",
-          "gross:turns"),
-    Check("aligned", "Are positions far worse than those aligned before the fit?", "0 of 1,200", "numbers.md",
-          "gross:aligned"),
-    Check("overfitted", "Are unseen records missed by far more than those that trained?", "2 of 1,200", "numbers.md",
+          "residual_structure:neighbours", "mathematics.md"),
+    Check("correlated", "Which estimates correlate strongly?", EXACT, "verdict:correlated", "identifiability.md"),
+    Check("computed", "Do the tips come from the joints, not from an instrument?", "0 of 1,200", "gross:computed",
+          "data.md"),
+    Check("gross", "Is the error gross beside the arm's reach?", "0 of 1,200", "gross:gross"),
+    Check("jump", "Do the records contradict one another from one place on?", "0 of 1,200", "gross:jumped"),
+    Check("minority", "Do many records contradict the others?", "0 of 1,200", "outliers:contradicting"),
+    Check("size", "Is the calibrated arm as large as the nominal one?", "0.4 %", "gross:size"),
+    Check("displaced", "Is a parameter far from its prior or its nominal value?", "0 of 1,200", "gross:displaced"),
+    Check("scale", "Which error of an instrument's scale would not show?", "5 %", "gross:scale", "trackers.md"),
+    Check("payload", "Which payload would not show?", EXACT, "gross:payload", "effects.md"),
+    Check("elsewhere", "How well is the tool known away from the contacts?", EXACT, "verdict:away",
+          "ball_and_sockets.md"),
+    Check("worse", "Are unseen records missed by more than by the nominal arm?", "0.5 %", "gross:worse"),
+    Check("turns", "Are orientations grossly off, or worse than the nominal arm's?", "0 of 1,200", "gross:turns"),
+    Check("aligned", "Are positions far worse than those aligned before the fit?", "0 of 1,200", "gross:aligned"),
+    Check("overfitted", "Are unseen records missed by far more than those that trained?", "2 of 1,200",
           "gross:overfit"),
-    Check("weights", "Does the declared noise predict better than estimated variances?", NOTES, "noise.md",
-          "gross:weights"),
-    Check("intervals", "Do prediction intervals cover their share?", "0.5 %", "numbers.md", "coverage:covered"),
-    Check("places", "How well are base and target known?", EXACT, "numbers.md", "verdict:places"),
-    Check("moved", "Did what the arm touches move?", "0 of 1,200", "ball_and_sockets.md", "outliers:moved"),
-    Check("still", "Did a joint stand still?", EXACT, "data.md", "data:still"),
-    Check("same_poses", "Are held-out records at poses that trained?", EXACT, "numbers.md", "data:same_poses"),
-    Check("outliers", "Are records missed by more than noise explains?", "1 %", "noise.md", "outliers:outlying"),
-    Check("next", "What is least certain, and which poses would add most?", EXACT, "plan.md", "verdict:next_poses"),
+    Check("intervals", "Do prediction intervals cover their share?", "0.5 %", "coverage:covered"),
+    Check("places", "How well are base and target known?", EXACT, "verdict:places"),
+    Check("moved", "Did what the arm touches move?", "0 of 1,200", "outliers:moved", "ball_and_sockets.md"),
+    Check("still", "Did a joint stand still?", EXACT, "data:still", "data.md"),
+    Check("same_poses", "Are held-out records at poses that trained?", EXACT, "data:same_poses"),
+    Check("outliers", "Are records missed by more than noise explains?", "1 %", "outliers:outlying", "noise.md"),
+    Check("next", "What is least certain, and which poses would add most?", EXACT, "verdict:next_poses", "plan.md"),
 )  # fmt: skip
 """Of a fit, in the order of the verdict within one grade."""
 
@@ -143,7 +135,7 @@ def plugin_checks(registry: PluginRegistry, before_fit: bool) -> Iterator[Check]
         own = component.load()
         if bool(getattr(own, "before_fit", False)) == before_fit:
             rate, page = getattr(own, "rate", NO_RATE), getattr(own, "page", "")
-            yield Check(component.name, component.summary, rate, page, component.target, component.plugin)
+            yield Check(component.name, component.summary, rate, component.target, page, component.plugin)
 
 
 def first_few(texts: Sequence[str], most: int = 5) -> str:

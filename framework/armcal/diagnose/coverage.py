@@ -2,11 +2,10 @@
 
 Residuals of records that took no part in a fit are put in units of what was predicted for them. If the model's own
 error is not Gaussian, or larger in some poses than in others, the shares held differ from the levels claimed. The
-intervals are then stretched by the quantile of these scores, level by level, as conformal prediction does with scores
-in units of the predicted spread [Lei2018]. Its guarantee does not hold here: scores are those of folds, set against
-what the whole fit predicts, so that they are not exchangeable with those of new records, and poses must be alike. A
-stretch is never judged by the records it comes from: each fold of a cross-validation is judged by the stretch that the
-scores of the other folds give (cross-conformal [Vovk2015]).
+intervals are then stretched by the quantile of these scores, level by level, as conformal prediction does [Lei2018].
+Its guarantee does not hold here: scores of folds, set against what the whole fit predicts, are not exchangeable with
+those of new records, and poses must be alike. Each fold is judged by the stretch that the scores of the other folds
+give (cross-conformal [Vovk2015]).
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,7 +16,7 @@ import numpy as np
 from scipy.special import betainc
 
 from armcal.arm.assembly import command_channels
-from armcal.base.arrays import Array, Indices
+from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.base.units import readable
 from armcal.diagnose.causes import MOST_LEVELS
@@ -56,26 +55,20 @@ class Scores:
     reaches: Array  # lengths of position residuals over their 95 % radii, one row a position factor (n_p x N)
     freedom: float | Array  # degrees of freedom of the fit that predicted them
 
-    def of_level(self, level: float) -> Array:
-        return np.asarray(np.abs(self.errors) / quantile(level, self.freedom))
-
     @property
     def by_name(self) -> dict[str, tuple[float, Array]]:
         """Each level with the sizes of what was missed in its half widths, then 95 % with those in radii."""
-        levels = {level_name(level): (level, self.of_level(level)) for level in LEVELS}
+        sizes = np.abs(self.errors)
+        levels = {level_name(level): (level, np.asarray(sizes / quantile(level, self.freedom))) for level in LEVELS}
         return {**levels, _RADIUS: (RADIUS_LEVEL, self.reaches)}
 
     @property
     def judged(self) -> Array:
-        """Whether each record was judged (N), by any of its measurements."""
         return np.asarray(np.isfinite(self.errors).any(axis=0))
 
 
 class Stretch(Settings):
-    """What half widths are multiplied by, one number a level, and what 95 % radii are (None without positions).
-
-    A calibration keeps it as it is.
-    """
+    """What half widths are multiplied by, one number a level, and what 95 % radii are (None without positions)."""
 
     coordinates: dict[str, float]
     radius: float | None = None
@@ -94,23 +87,18 @@ class Coverage:
     stretched: Shares | None  # by stretches of other records; None where there were too few
     independent: float  # how many independent numbers the judged ones are worth
 
-    @property
-    def stated(self) -> Shares:
-        return self.stretched or self.raw
-
     def as_dict(self) -> dict[str, object]:
         return {
             "records": self.records,
             "coordinates": self.coordinates,
             "worth_independent": self.independent,
-            "share": self.stated,
+            "share": self.stretched or self.raw,
             "share_without_stretch": self.raw,
             "stretched": self.stretched is not None,
         }
 
 
 def level_name(level: float) -> str:
-    """Of a level or a share as a key: ``90``."""
     return f"{100 * level:g}"
 
 
@@ -123,15 +111,13 @@ def predictor(fitted: WeighedFit) -> Predictor:
 
 def missed(by: Predictor, held: Problem) -> dict[Recording, tuple[Array, ...]]:
     """Residuals of records that a fit did not see; nan where a measurement was not made."""
-    residuals: dict[Recording, tuple[Array, ...]] = {"same": by.residuals(held)}
+    residuals: dict[Recording, Sequence[Array]] = {"same": by.residuals(held)}
     if by.drift is not None:
         residuals["new"] = held.residuals(by.values)
+    measured = [one.measured for one in held.records]
     return {
-        name: tuple(
-            np.where(factor_records.measured, own, np.nan)
-            for factor_records, own in zip(held.records, held_residuals, strict=True)
-        )
-        for name, held_residuals in residuals.items()
+        name: tuple(np.where(known, own, np.nan) for known, own in zip(measured, parts, strict=True))
+        for name, parts in residuals.items()
     }
 
 
@@ -153,7 +139,6 @@ def whitened_like(held: Problem, fitted: WeighedFit, estimator: Estimator) -> Pr
 
 @judging
 def fit_and_predict(task: FitTask) -> JudgedFit:
-    """Fit, judge, and how it missed; see ``fit_and_judge``."""
     if task.problem.blueprint.groups:
         return fit_and_judge(task)  # a socket that is found anew from the records that judge it has no interval
     train, held = task.parts()
@@ -162,17 +147,9 @@ def fit_and_predict(task: FitTask) -> JudgedFit:
     return replace(judged_fit(train, held, fitted.solution), held_residuals=own)
 
 
-def besides(scores: Scores, places: Indices) -> Scores:
-    errors = scores.errors.copy()
-    errors[:, places] = np.nan
-    return replace(scores, errors=errors)
-
-
 def stretch(scores: Scores) -> Stretch | None:
-    """From the scores of records that no other stretch comes from; None if there are too few.
-
-    Of n scores the ceil((n + 1) p)-th smallest, or the largest: the finite-sample quantile of [Lei2018].
-    """
+    """From the scores of records that no other stretch comes from; None if there are too few. Of n scores the
+    ceil((n + 1) p)-th smallest, or the largest: the finite-sample quantile of [Lei2018]."""
     judged, ranked = scores.judged, dict[str, float]()
     if judged.sum() < FEWEST:
         return None
@@ -189,30 +166,22 @@ def coverage(scores: Scores, stretches: Sequence[Stretch | None] = ()) -> Covera
     if not len(judged):
         return None
     factors = [stretches[int(i)] for i in judged] if len(stretches) else []
-    widened = {_RADIUS: [np.nan if s is None or s.radius is None else s.radius for s in factors]}
-    known = bool(factors) and all(factors)
-    if known:
-        widened |= {level_name(p): [s.coordinates[level_name(p)] for s in factors if s] for p in LEVELS}
-
-    def held(by_stretches: bool) -> dict[str, Array]:
-        """Whether each number lies within its interval (n x N each): one, zero, or nan where there is none."""
-        return {
-            name: np.where(np.isfinite(sizes), sizes <= (np.array(widened[name]) if by_stretches else 1.0), np.nan)
-            for name, sizes in ((name, sizes[:, judged]) for name, (_, sizes) in scores.by_name.items())
-        }
-
-    raw, within = held(False), held(known)
-    shares, stretched = (
-        {name: float(np.nanmean(one)) if np.isfinite(one).any() else None for name, one in of.items()}
-        for of in (raw, within)
-    )
+    known, raw, stretched, within = bool(factors) and all(factors), Shares(), Shares(), dict[str, Array]()
+    for name, (_, every) in scores.by_name.items():
+        sizes, width = every[:, judged], np.ones(1)
+        if known:
+            own = [one and (one.radius if name == _RADIUS else one.coordinates[name]) for one in factors]
+            width = np.array([np.nan if one is None else one for one in own])
+        for shares, limit in ((raw, 1.0), (stretched, width)):
+            within[name] = np.where(np.isfinite(sizes), sizes <= limit, np.nan)  # one, zero, or nan where there is none
+            shares[name] = float(np.nanmean(within[name])) if np.isfinite(within[name]).any() else None
     stated = within[level_name(STATED)]
     count = int(np.isfinite(stated).sum())
-    return Coverage(len(judged), count, shares, stretched if known else None, _worth(stated))
+    return Coverage(len(judged), count, raw, stretched if known else None, _worth(stated))
 
 
 def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -> Finding:
-    share, raw = ((own[level_name(STATED)] or 0.0) for own in (shares.stated, shares.raw))
+    share, raw = ((own[level_name(STATED)] or 0.0) for own in (shares.stretched or shares.raw, shares.raw))
     within, beyond = share * shares.independent, (1 - share) * shares.independent
     few, many = betainc(max(beyond, 1e-9), within + 1, 1 - STATED), betainc(max(within, 1e-9), beyond + 1, STATED)
     off = min(few, many) < LEVEL / 2
@@ -230,11 +199,9 @@ def coverage_finding(shares: Coverage, of: str, recording: Recording = "same") -
 
 
 def _worth(held: Array) -> float:
-    """How many independent numbers (n_r x N, in recorded order) would have a share as uncertain as theirs.
-
-    The standard error of a record's share over circular blocks of neighbours [Politis1992] against that of
-    independent numbers; no more than there are, and where all or none were held no more than the records.
-    """
+    """How many independent numbers (n_r x N, in recorded order) would have a share as uncertain as theirs: by the
+    standard error over circular blocks of neighbours [Politis1992]. No more than there are; where all or none were held
+    no more than the records."""
     share, by_record = float(np.nanmean(held)), np.nanmean(held, axis=0)
     if share in (0.0, 1.0):
         return float(held.shape[1])
@@ -250,19 +217,13 @@ def predictions(fit: Fit) -> Predictor:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Prediction intervals of one recording, the calibration's own or a new one.
+    """Prediction intervals of one recording, the calibration's own or a new one."""
 
-    Attributes:
-        stretch: what half widths are multiplied by, from cross-validation; None without.
-        crossed: shares held of training records, by folds that did not see them; stretched from the other folds.
-        half_width_mm: of 90 % intervals of a position coordinate, median over all records; stretched.
-    """
-
-    stretch: Stretch | None
-    crossed: Coverage | None
+    stretch: Stretch | None  # what half widths are multiplied by, from cross-validation; None without
+    crossed: Coverage | None  # shares held of training records, by folds without them; stretched from the other folds
     holdout: Coverage | None  # shares held of held-out records
-    half_width_mm: float | None  # None without positions
-    radius_mm: float | None  # of 95 % radii of positions, likewise
+    half_width_mm: float | None  # of 90 % intervals of a position coordinate, median over all records, stretched
+    radius_mm: float | None  # of 95 % radii of positions, likewise; None without positions
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -276,24 +237,23 @@ class Intervals:
 
 def intervals(fit: Fit) -> dict[Recording, Intervals]:
     """How wide prediction intervals are, by recording: the calibration's own, and where something drifts a new one.
-
-    Nothing of a fit that did not converge.
-    """
-    problem, split = fit.problem, fit.split
+    Nothing of a fit that did not converge."""
+    problem, split, result = fit.problem, fit.split, dict[Recording, Intervals]()
     if not fit.converged or problem.blueprint.groups:
         return {}  # a contact reads nothing that could be predicted
     by, alike = fit.of(predictions), whitened_like(problem, fit.fitted, fit.estimator)
     places = [i for i, kernel in enumerate(problem.kernels) if is_position(kernel)]
     held_out, trained = alike.subset(split.holdout) if len(split.holdout) else None, _crossed(fit)
     unseen = {} if held_out is None else missed(by, held_out)
-    result = dict[Recording, Intervals]()
     names: tuple[Recording, ...] = ("same",) if by.drift is None else ("same", "new")
     for name in names:
-        crossed, holdout, widened = None, None, None
+        crossed = holdout = widened = half = radius = None
         if name in trained:
             others: list[Stretch | None] = [None] * len(split.train)
             for part in fit.ready.folds:
-                apart = stretch(besides(trained[name], part.holdout))
+                errors = trained[name].errors.copy()
+                errors[:, part.holdout] = np.nan
+                apart = stretch(replace(trained[name], errors=errors))
                 for i in part.holdout:
                     others[i] = apart
             crossed = coverage(trained[name], others)
@@ -302,7 +262,6 @@ def intervals(fit: Fit) -> dict[Recording, Intervals]:
         if held_out is not None:
             scores = scored(held_out, unseen[name], by.spreads(held_out, name))
             holdout = coverage(scores, [widened] * len(split.holdout))
-        half = radius = None
         if places:
             whole = by.spreads(alike, name)
             spreads = [whole[i].of(POSITION) for i in places]
@@ -314,21 +273,10 @@ def intervals(fit: Fit) -> dict[Recording, Intervals]:
     return result
 
 
-def _levels(fit: Fit) -> int:
-    """The most angles at which any turning joint stood; 0 where they are many, or an arm states its joints' noise."""
-    arms = fit.problem.blueprint.arms
-    channels = [channel for channel, dimension in command_channels(arms).items() if dimension == "angle"]
-    most = max((len(np.unique(np.round(fit.dataset.column(channel), 9))) for channel in channels), default=0)
-    return most if most <= MOST_LEVELS and not any(arm.joint_noise for arm in arms.values()) else 0
-
-
 def _crossed(fit: Fit) -> dict[Recording, Scores]:
-    """Scores of training records, by recording; none without folds.
-
-    Residuals of the folds are put in units of what the whole fit would have predicted for the record: a fold with fewer
-    records claims less, and by its own claims would let the whole fit claim too much.
-    """
-    by, problem, folds = fit.of(predictions), fit.fitted.problem, fit.ready.folds
+    """Scores of training records, by recording; none without folds. Residuals of the folds are put in units of what the
+    whole fit would have predicted: a fold with fewer records claims less."""
+    by, problem, folds, scores = fit.of(predictions), fit.fitted.problem, fit.ready.folds, dict[Recording, Scores]()
     fits = fit.crossed.fits if fit.crossed is not None else ()
 
     def together(parts: Iterable[Sequence[Array] | None], missing: float) -> tuple[Array, ...] | None:
@@ -342,7 +290,7 @@ def _crossed(fit: Fit) -> dict[Recording, Scores]:
         return whole
 
     # What the pose residuals of folds did not know of the records that they did not see; None without any.
-    unknown, scores = together([one.unknown for one in fits], 0.0) if fits else None, dict[Recording, Scores]()
+    unknown = together([one.unknown for one in fits], 0.0) if fits else None
     for name in dict.fromkeys(name for one in fits for name in one.held_residuals):
         parts = [[rows.T for rows in one.held_residuals[name]] if one.held_residuals else None for one in fits]
         residuals = [rows.T for rows in together(parts, np.nan) or ()]
@@ -351,11 +299,9 @@ def _crossed(fit: Fit) -> dict[Recording, Scores]:
 
 
 def covered(fit: Fit) -> list[Finding]:
-    """How good a prediction is in the median pose, and whether intervals hold their shares.
-
-    Held-out records judge best, else cross-validated ones.
-    """
-    own, findings = fit.of(intervals), list[Finding]()
+    """How good a prediction is in the median pose, and whether intervals hold their shares: of held-out records, else
+    of cross-validated ones."""
+    own, findings, arms = fit.of(intervals), list[Finding](), fit.problem.blueprint.arms
     half, radius = ({name: getattr(one, of) for name, one in own.items()} for of in ("half_width_mm", "radius_mm"))
     first: Recording = "new" if "new" in own else "same"
     if half.get(first) is not None:
@@ -363,9 +309,10 @@ def covered(fit: Fit) -> list[Finding]:
         text += f"+- {readable(half[first])} mm a coordinate (90 %), {readable(radius[first])} mm in all (95 %)"
         if first == "new":
             text += f"; within this recording to +- {readable(half['same'])} mm and {readable(radius['same'])} mm"
-        text += ", the measurement's noise included."
-        action = ""
-        if levels := _levels(fit):
+        text, action = f"{text}, the measurement's noise included.", ""
+        turning = [channel for channel, dimension in command_channels(arms).items() if dimension == "angle"]
+        levels = max((len(np.unique(np.round(fit.dataset.column(one), 9))) for one in turning), default=0)
+        if 0 < levels <= MOST_LEVELS and not any(arm.joint_noise for arm in arms.values()):
             text += f" Each joint stood at {levels} angles at most: what it is off between them is not included."
             action = "State what the joints are off between those angles as arms.NAME.joint_noise_deg, or measure "
             action += "poses between."

@@ -4,8 +4,10 @@ Do measured positions fit the model far better with axes or joints exchanged or 
 changes are tried first; where none explains the data, the base elsewhere, then several at once. Each reading of the
 data is given the same chance: where the base may stand anywhere, it and the target are found anew, and what counts is
 what is left of its residuals once all free parameters have adapted to first order. The likeliest are then fitted: a
-right reading leaves little, a wrong one cannot be mended by any parameters.
+right reading leaves little, a wrong one fits by no parameters.
 """
+
+from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import Arm, command_channels, shown_joint
-from armcal.base.arrays import Array, Indices, Mask
+from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
 from armcal.config.system import System
@@ -43,8 +45,7 @@ from armcal.problem.rigid_alignment import (
 Wires = Mapping[str, tuple[Mapping[str, float], float]]
 """Channels, each read as a sum of channels times factors, and a summand."""
 _DEGREES, _TURN, _MRAD = 180 / np.pi, 360.0, 1000 * np.pi / 180
-_ZEROS_DEG = (180, 90, -90)
-"""What the zero of a joint is off by: half the counts of a servo, or where another convention has it."""
+_ZEROS_DEG = (180, 90, -90)  # Of a joint's zero: half the counts of a servo, or where another convention has it
 _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
@@ -65,7 +66,6 @@ LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two 
 
 
 def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
-    """Each joint's sign, each two joints of a kind exchanged, and all angles, one, or one travel in another unit."""
     joints = tuple(arm.commanded)
     angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
     readings: list[tuple[str, Wires]] = [
@@ -96,7 +96,6 @@ def coupled_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
 
 
 def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
-    """The signs of several joints, and joints in reverse order or shifted."""
     joints = tuple(arm.commanded)
     for size in range(2, len(joints) + 1) if len(joints) <= _MOST_SIGNS else ():
         for chosen in combinations(joints, size):
@@ -111,17 +110,6 @@ def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
             )
 
 
-def axes_words(order: Sequence[int], signs: Sequence[float]) -> str:
-    moved = [i for i in range(3) if order[i] != i]
-    negative = [_AXES[order[i]] for i in range(3) if signs[i] < 0]
-    if len(moved) == 2 and not negative:
-        return f"{_AXES[moved[0]]} and {_AXES[moved[1]]} exchanged"
-    if not moved:
-        return f"the sign{'s' * (len(negative) > 1)} of {' and '.join(negative)} reversed"
-    taken = (f"{'-' if sign < 0 else ''}{_AXES[axis]}" for axis, sign in zip(order, signs, strict=True))
-    return f"({', '.join(taken)}) taken for (x, y, z)"
-
-
 def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.0) -> Wires:
     return {
         f"{arm.name}.{part}{joint}": ({f"{arm.name}.{part}{other}": scale}, summand)
@@ -132,12 +120,19 @@ def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.
 
 def turned_axes() -> Iterator[tuple[str, Array]]:
     """All exchanges and signs of axes but none (3 x 3), in words."""
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            turn = np.zeros((3, 3))
-            turn[range(3), order] = signs
-            if not np.array_equal(turn, np.eye(3)):
-                yield axes_words(order, signs), turn
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        moved, negative = [i for i in range(3) if order[i] != i], [_AXES[order[i]] for i in range(3) if signs[i] < 0]
+        if not moved and not negative:
+            continue
+        taken = (f"{'-' if sign < 0 else ''}{_AXES[axis]}" for axis, sign in zip(order, signs, strict=True))
+        words = f"({', '.join(taken)}) taken for (x, y, z)"
+        if len(moved) == 2 and not negative:
+            words = f"{_AXES[moved[0]]} and {_AXES[moved[1]]} exchanged"
+        elif not moved:
+            words = f"the sign{'s' * (len(negative) > 1)} of {' and '.join(negative)} reversed"
+        turn = np.zeros((3, 3))
+        turn[range(3), order] = signs
+        yield words, turn
 
 
 def scaled_positions() -> Iterator[tuple[str, Array]]:
@@ -147,11 +142,6 @@ def scaled_positions() -> Iterator[tuple[str, Array]]:
     for axis, factor in product(range(3), _AXIS_LENGTHS):
         scale = np.diag([factor if i == axis else 1.0 for i in range(3)])
         yield f"{_AXES[axis]} {factor:.4g} times as large", scale
-
-
-def unit_mistaken(factor: float) -> str:
-    pairs = product(_UNITS.items(), repeat=2)
-    return next(f"{own} among {other}" for (own, size), (other, taken) in pairs if np.isclose(taken / size, factor))
 
 
 def check_reach(problem: Problem, dataset: Dataset) -> None:
@@ -165,34 +155,33 @@ def check_reach(problem: Problem, dataset: Dataset) -> None:
         channels = kernel.factor.output_channels
         if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
             continue
-        name, measured = kernel.factor.name, dataset.stacked(channels)
+        name, measured, where = kernel.factor.name, dataset.stacked(channels), Location(dataset.source)
         factor, wrong = _in_another_unit(measured, own.outputs[:3])
         if wrong.any():
             first, count = int(np.argmax(wrong)), int(wrong.sum())
             which, more = f"the position of record {dataset.ids[first]} is", ""
             if count > 1:
                 which, more = f"{count} of {len(dataset)} positions are", f" (the first: record {dataset.ids[first]})"
+            units = ((a, b) for a, b in product(_UNITS, repeat=2) if np.isclose(_UNITS[b] / _UNITS[a], factor))
             raise DataError(
-                f"{name}: {which} about {digits(factor)} times as far from the base frame "
-                f"as the model's tip, the others as far{more}: {unit_mistaken(factor)}?",
-                where=Location(dataset.source, row=dataset.rows[first] if dataset.rows else None),
+                f"{name}: {which} about {digits(factor)} times as far from the base frame as the model's tip, the "
+                f"others as far{more}: {' among '.join(next(units))}?",
+                where=replace(where, row=dataset.rows[first] if dataset.rows else None),
                 hint="Write all rows in the unit of the column names.",
             )
         far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
         if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
             raise DataError(
                 f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",
-                where=Location(dataset.source),
+                where=where,
                 hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
             )
 
 
 def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
-    """Positions so many times as far out as the model's (3 x N each, m), where the others are as far; or none.
-
-    Many are known by their distances alone, as where half of them spoil the place of the base. Few are where the model
-    has them once they are divided by that, and the others are typically where it has them.
-    """
+    """Positions so many times as far out as the model's (3 x N each, m), where the others are as far; or none. Many are
+    known by their distances alone, as where half of them spoil the place of the base; few are where the model has them
+    once they are divided by that, and the others are typically where it has them."""
     far, distances, missed = (np.linalg.norm(x, axis=0) for x in (shown, measured, measured - shown))
     far = np.maximum(far, _NEAREST)
     orders = np.log10(np.where(distances > 0, distances, np.nan) / far)
@@ -210,29 +199,6 @@ def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:
     return best[1:]
 
 
-def two_frames(tools: Tools, measured: Array, basis: Array) -> tuple[float, int] | None:
-    """What records (3 x n, m) in two frames leave (root mean square, m), and which of them begins the second.
-
-    Each part is aligned by itself, from a few divisions on, and the division put where both alignments leave least, in
-    turn; None where records are too few.
-    """
-    every = np.arange(measured.shape[1])
-    if len(every) < 2 * FEWEST_IN_PART:
-        return None
-    divisions = []
-    for part in _PARTS:
-        begins = round(part * len(every))
-        for _ in range(_ROUNDS):
-            begins = min(max(begins, FEWEST_IN_PART), len(every) - FEWEST_IN_PART)
-            halves = [nearest(tools.subset(own), measured[:, own], basis) for own in (every[:begins], every[begins:])]
-            squares = [np.sum((measured - alignment.moved(tools)) ** 2, axis=0) for alignment in halves]
-            before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
-            left = before + after[-1] - after
-            begins = int(np.argmin(left[FEWEST_IN_PART:-FEWEST_IN_PART])) + FEWEST_IN_PART
-            divisions.append((float(np.sqrt(left[begins] / len(every))), begins))
-    return min(divisions)
-
-
 def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> FactorRecords:
     read = own.record.copy()
     for channel, (others, added) in read_as.items():
@@ -243,10 +209,8 @@ def rewired(channels: Sequence[str], own: FactorRecords, read_as: Wires) -> Fact
 
 
 def kept_spread(read: Array, measured: Array) -> float:
-    """How far positions are spread as they are read (3 x N, m); as in their thinnest direction where that grew thinner.
-
-    A reading that flattens what was measured hides anything in the direction in which it does.
-    """
+    """How far positions are spread as they are read (3 x N, m); as in their thinnest direction where that grew thinner:
+    a reading that flattens what was measured hides anything in the direction in which it does."""
     own, given = (np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(p, bias=True)), 0.0)) for p in (read, measured))
     flattened = own[0] * np.linalg.norm(given) < (1 - _ROUNDED) * given[0] * np.linalg.norm(own)
     return float(np.sqrt(len(own)) * own[0] if flattened else np.linalg.norm(own))
@@ -254,23 +218,17 @@ def kept_spread(read: Array, measured: Array) -> float:
 
 @dataclass(frozen=True)
 class Adapting:
-    """Predicted positions (3 x N, m), and how the free parameters, in typical scales, move them: U S V' (3N x n)."""
+    """Predicted positions, and how the free parameters, in typical scales, move them: U S V'."""
 
-    predicted: Array
-    ways: Array
+    predicted: Array  # (3 x N, m)
+    paths: Array  # (3N x n)
     sizes: Array
 
-    def left(self, measured: Array, enough: float = np.inf) -> float:
-        """Root mean square distance once the free parameters have adapted to first order, not too far (m).
-
-        Where more than ``enough`` is left however far they adapt, that is given.
-        """
-        return float(self.left_of_each(measured[None], enough)[0])
-
-    def left_of_each(self, measured: Array, enough: float) -> Array:
-        """The same of several readings (k x 3 x N) of what was measured (k)."""
+    def left(self, measured: Array, enough: float = np.inf) -> Array:
+        """Root mean square distance of several readings (k x 3 x N) once the free parameters have adapted (k, m), to
+        first order, not too far. Where more than ``enough`` is left however far they adapt, that is given."""
         off = (measured - self.predicted).transpose(0, 2, 1).reshape(len(measured), -1)
-        along, unit = off @ self.ways, 3 / max(1, off.shape[1] - len(self.sizes))
+        along, unit = off @ self.paths, 3 / max(1, off.shape[1] - len(self.sizes))
         left = np.sum(off**2, axis=1) - np.sum(along**2, axis=1)
         for i in np.flatnonzero(unit * left <= enough**2):
             fitted = self.sizes * within(along[i], self.sizes, _FAR * np.sqrt(len(self.sizes)))
@@ -279,7 +237,7 @@ class Adapting:
 
     def can_move(self, turn: Array, shift: Array) -> bool:
         moved = (np.cross(Rotation.from_matrix(turn).as_rotvec(), self.predicted.T) + shift).ravel()
-        along = self.ways.T @ moved
+        along = self.paths.T @ moved
         return float(moved @ moved - along @ along) <= _TURNED**2 * float(moved @ moved)
 
 
@@ -294,25 +252,6 @@ def within(along: Array, sizes: Array, radius: float) -> Array:
         steps = along * sizes / (sizes**2 + damping)
         low, high = (damping, high) if np.linalg.norm(steps) > radius else (low, damping)
     return np.asarray(steps)
-
-
-def is_place(names: Sequence[str]) -> bool:
-    return tuple(name[-1:] for name in names[:3]) == tuple(_AXES)
-
-
-def apart_in_groups(problem: Problem, number: int, values: Array) -> float:
-    """How far single records of a group typically put its place from their middle (m): all are of one without groups.
-
-    Raises:
-        NotConvergedError: a record has no elastic equilibrium at these values.
-    """
-    own = problem.records[number]
-    groups = np.zeros(own.count) if own.group is None else own.group[: own.count]
-    places = problem.grouped[number].nuisance_starts(values, own)[:3, : own.count]
-    members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
-    middles = [np.median(places[:, chosen], axis=1, keepdims=True) for chosen in members]
-    away = [places[:, chosen] - middle for chosen, middle in zip(members, middles, strict=True)]
-    return float(np.median(np.linalg.norm(np.hstack(away), axis=0))) if away else np.inf
 
 
 MUCH_BETTER = 3.0  # A permutation leaves so many times less than the data as they stand
@@ -357,16 +296,42 @@ class _Reading:
 
 @dataclass(frozen=True)
 class _Seen:
+    """A measurement that gives positions in the base frame, and what is left however it is read."""
+
+    problem: Problem
     sighting: Sighting  # what was measured
     records: FactorRecords  # of its kernel alone, their noise as declared
     rows: tuple[tuple[str, Array], ...]  # what was measured a row before and a row after, in words (3 x n each, m)
-    placing: Placing | None  # what places the arm; None where its base may not stand anywhere
-    noise: Array  # declared, of each axis (3, m)
-    ids: tuple[str, ...] = ()  # of the records (n)
+    ids: tuple[str, ...]  # of the records (n)
+    placing: Placing | None = None  # what places the arm; None where its base may not stand anywhere
+
+    @classmethod
+    def of(cls, problem: Problem, dataset: Dataset, number: int) -> Self | None:
+        """Of at most so many records; those without both neighbours are left out, unless these are most."""
+        sighting, rows = sighting_of(problem, dataset, number, _MOST_RECORDS), tuple[tuple[str, Array], ...]()
+        if sighting is None:
+            return None
+        positions = dataset.stacked(problem.kernels[number].factor.position_channels)
+        lines = np.array(dataset.rows or range(len(dataset)))
+        whole = np.flatnonzero(problem.records[number].measured)
+        place = {line: i for i, line in zip(whole, lines[whole], strict=True)}
+        beside = np.array([[place.get(lines[i] + step, -1) for i in sighting.chosen] for step in (-1, 1)])
+        both = np.flatnonzero((beside >= 0).all(axis=0))
+        if 2 * len(both) >= len(sighting.chosen):
+            sighting, words = sighting.subset(both), "the positions of the row {} taken for each row's"
+            rows = tuple((words.format(w), positions[:, beside[i][both]]) for i, w in enumerate(("before", "after")))
+        if 3 * len(sighting.chosen) < _EQUATIONS * max(problem.increments, 6):
+            return None
+        own = replace(problem.subset(sighting.chosen).records[number], whitening=None, correlation=None)
+        return cls(problem, sighting, own, rows, tuple(dataset.ids[i] for i in sighting.chosen))
 
     @property
     def measured(self) -> Array:
         return self.sighting.measured
+
+    @property
+    def noise(self) -> Array:
+        return np.array(self.problem.kernels[self.sighting.kernel].factor.noise[:3])
 
     def thinned(self, most: int) -> Self:
         every = np.arange(0, self.records.count, max(1, -(-self.records.count // most)))
@@ -374,17 +339,189 @@ class _Seen:
         (records,) = subset([self.records], every)
         return replace(self, sighting=self.sighting.subset(every), records=records, rows=rows)
 
+    def read(self, read_as: Wires) -> FactorRecords:
+        return rewired(self.problem.kernels[self.sighting.kernel].factor.channels, self.records, read_as)
+
+    def positions(self, read_as: Wires, values: Array) -> Adapting | None:
+        """At these values, channels read as others, times a factor; None where a record has no equilibrium."""
+        records, parameters = self.read(read_as), self.problem.parameters
+        try:
+            blocks = list(self.problem.grouped[self.sighting.kernel].linearised(values, records))
+        except NotConvergedError:
+            return None
+        noise, count = self.noise[:, None], records.count
+        slopes, residual = (np.concatenate(parts, axis=-1)[:3, ..., :count] for parts in zip(*blocks, strict=True))
+        rows = (slopes * noise[:, :, None]).transpose(2, 0, 1).reshape(3 * count, -1)
+        rows = rows @ parameters.entries_jacobian(values) * parameters.scales()
+        basis, triangle = np.linalg.qr(rows)
+        paths, sizes, _ = np.linalg.svd(triangle, full_matrices=False)
+        kept = sizes > _SMALLEST * sizes.max(initial=0.0)
+        return Adapting(self.measured - residual * noise, basis @ paths[:, kept], sizes[kept])
+
+    def placed(self, read_as: Wires, measured: Array) -> tuple[Array, Array, float]:
+        """Values and positions in the base frame (3 x n), base and target found anew, and what is left (m)."""
+        # As configured: where records that are mixed up put base and target says nothing of another reading of them.
+        placing, number, nominal = self.placing, self.sighting.kernel, self.problem.blueprint.parameters.nominal()
+        if placing is None:
+            return nominal, measured, 0.0
+        tools = tools_of(self.problem.with_record(number, self.read(read_as)), nominal, number)
+        alignment = nearest(tools, measured, placing.basis)
+        values = placing.with_target(self.problem.parameters, nominal, alignment.offset)
+        return values, alignment.back(measured), alignment.left
+
+    def left(self, read_as: Wires, measured: Array, enough: float = np.inf) -> float:
+        """What a reading leaves where base and target are found anew: roughly, if that is far more than enough (m)."""
+        values, measured, left = self.placed(read_as, measured)
+        if left > _ROUGHLY * enough:
+            return left
+        positions = self.positions(read_as, values)
+        return np.inf if positions is None else float(positions.left(measured[None], enough)[0])
+
+    def fitted(self, read_as: Wires, measured: Array) -> float:
+        """What a short fit of a reading typically leaves (median, m); infinite if it leads far from the nominal arm."""
+        number = self.sighting.kernel
+        values, measured, _ = self.placed(read_as, measured)
+        some = [*self.problem.subset(self.sighting.chosen).records]
+        some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in some]
+        own, rows = self.read(read_as), np.zeros(len(self.problem.kernels[number].factor.noise))
+        rows[:3] = 1 / self.noise
+        some[number] = replace(own, whitening=np.tile(np.diag(rows)[:, :, None], len(own.weight)))
+        shown = Tools(measured, np.tile(np.eye(3), (own.count, 1, 1)))
+        problem = shown_instead(self.problem.with_records(some), number, shown)
+        posed = PosedProblem(problem)
+        try:
+            if problem.increments:
+                matters = np.diag(posed.model(posed.x(values)).hessian)
+                x = descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3)
+                if np.abs(x - posed.x(values))[matters > _DETERMINED * matters.max()].max(initial=0.0) > _FARTHEST:
+                    return np.inf
+                values = posed.values(x)
+            return float(np.median(np.linalg.norm(problem.residuals(values)[number][:3], axis=0)))
+        except NotConvergedError:
+            return np.inf
+
+    def axes(self, straight: Adapting) -> Iterator[tuple[str, Array]]:
+        if self.placing is not None:
+            yield LEFT_HANDED, np.diag([1.0, 1.0, -1.0]) @ self.measured
+        else:
+            for words, turn in turned_axes():
+                if np.linalg.det(turn) < 0 or not straight.can_move(turn, np.zeros(3)):
+                    yield words, turn @ self.measured
+        for words, scale in scaled_positions():
+            yield words, scale @ self.measured
+        yield from self.rows
+
+    def readings(
+        self,
+        wirings: Sequence[tuple[str, Wires]],
+        axes: Sequence[tuple[str, Array]],
+        straight: Adapting,
+        enough: float,
+    ) -> Iterator[_Reading]:
+        """Channels read otherwise, each beside each way of reading positions. What one leaves counts as many times more
+        as its positions are spread less than the arm's: measured ones near one point are near those of any arm."""
+        measured, size = np.array([moved for _, moved in axes]), spread_of(straight.predicted)
+        spreads = [max(kept_spread(moved, self.measured), _SMALLEST) for moved in measured]
+        for words, read_as in wirings:
+            if self.placing is not None:
+                lefts = [self.left(read_as, moved, enough) for moved in measured]
+            else:
+                adapting = self.positions(read_as, self.placed(read_as, self.measured)[0]) if read_as else straight
+                lefts = [] if adapting is None else adapting.left(measured, enough).tolist()
+            for left, spread, (own, moved) in zip(lefts, spreads, axes, strict=False):
+                weighed = np.inf if left > FITS * spread else left * max(1.0, size / spread)
+                yield _Reading(weighed, " and ".join(filter(None, (words, own))), bool(read_as), read_as, moved)
+
+    def in_two_frames(self) -> Iterator[_Reading]:
+        """The records from one on in another frame: each part is aligned by itself, from a few divisions on, and the
+        division put where both alignments leave least, in turn."""
+        every, measured, number = np.arange(len(self.sighting.chosen)), self.measured, self.sighting.kernel
+        if self.placing is None or len(every) < 2 * FEWEST_IN_PART:
+            return
+        nominal, basis = self.problem.blueprint.parameters.nominal(), self.placing.basis
+        tools, divisions = tools_of(self.problem.with_record(number, self.records), nominal, number), []
+        for part in _PARTS:
+            begins = round(part * len(every))
+            for _ in range(_ROUNDS):
+                begins = min(max(begins, FEWEST_IN_PART), len(every) - FEWEST_IN_PART)
+                halves = [nearest(tools.subset(own), measured[:, own], basis) for own in np.split(every, [begins])]
+                squares = [np.sum((measured - alignment.moved(tools)) ** 2, axis=0) for alignment in halves]
+                before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
+                left = before + after[-1] - after
+                begins = int(np.argmin(left[FEWEST_IN_PART:-FEWEST_IN_PART])) + FEWEST_IN_PART
+                divisions.append((float(np.sqrt(left[begins] / len(every))), begins))
+        least, begins = min(divisions)
+        words = f"the positions from record {self.ids[begins]} on taken for those in another frame"
+        yield _Reading(least, f"{words} (something moved there: calibrate both parts by themselves)", False)
+
+    def explained(self, readings: Sequence[_Reading], enough: float) -> list[tuple[_Reading, float]]:
+        """Readings that explain the records once fitted, the likeliest first, and what each then leaves (m): none where
+        a fit of the data as given comes nearly as near."""
+        likely = sorted((r for r in readings if r.left <= enough), key=lambda reading: reading.left)[:_FITTED]
+        if not likely:
+            return []
+        worse, explained = self.fitted({}, self.measured) / spread_of(self.measured), []
+        for reading in likely:
+            measured = reading.measured
+            left = reading.left if measured is None else self.fitted(reading.read_as, measured)
+            spread = kept_spread(self.measured if measured is None else measured, self.measured)
+            share, better = _EXPLAINS if worse <= _HOPELESS else _EXPLAINS_HOPELESS
+            if left <= min(max(_NOISE * float(np.linalg.norm(self.noise)), share * spread), spread * worse / better):
+                explained.append((reading, left))
+        return explained
+
+    def permuted(self, arm: Arm) -> PermutedAxes | None:
+        nominal = self.problem.parameters.nominal()
+        straight, seen, single = self.positions({}, nominal), self, single_joints(arm)
+        if straight is None:
+            return None
+        spread = max(spread_of(self.measured), spread_of(straight.predicted))
+        as_given = float(straight.left(self.measured[None])[0])
+        if as_given > MISSES * spread:
+            placing = placings(self.problem, self.sighting)[0]
+            seen = replace(self, placing=placing if placing.stands_anywhere else None)
+            as_given = min(as_given, seen.left({}, self.measured))
+        if as_given <= MISSES * spread:
+            return None
+        enough, joints = min(FITS * spread, as_given / MUCH_BETTER), [*single, *coupled_joints(arm)]
+        readings = [*seen.readings([("", {})], [*seen.axes(straight)], straight, enough)]
+        readings += [*seen.readings(joints, [("", self.measured)], straight, enough), *seen.in_two_frames()]
+        explained = seen.explained(readings, enough)
+        if not explained and seen.placing is None:
+            turn, shift = rigid_fit(straight.predicted, self.measured)
+            angle = float(np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
+            apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
+            moved = turn.T @ (self.measured - shift[:, None])
+            left = float(straight.left(moved[None])[0])
+            read = _Reading(left, f"the arm's base elsewhere by {apart}", False, {}, moved)
+            explained = seen.explained([read], enough)
+            if explained and straight.can_move(turn, shift):
+                return None  # the fit moves the base there by itself
+        if not explained:
+            seen = seen.thinned(_SEVERAL_RECORDS)
+            if seen.left({}, seen.measured) <= MISSES * spread:
+                return None  # as they stand, the records that are looked at fit: a few others are off
+            if (straight := seen.positions({}, nominal)) is None:
+                return None
+            axes = [("", seen.measured), *seen.axes(straight)]
+            axes = axes if seen.placing is None else axes[:2]
+            several = seen.readings([*single, *several_joints(arm)], axes, straight, enough)
+            explained = seen.explained([*several], enough)
+        if not explained:
+            return None
+        (best, left), name = explained[0], self.problem.kernels[self.sighting.kernel].factor.name
+        alike = [r.words for r, _ in explained if r.left <= _AS_GOOD * best.left and r.of_joints == best.of_joints]
+        return PermutedAxes(name, tuple(alike[:_MOST_NAMED]), as_given * _MM, left * _MM, best.of_joints)
+
 
 def find_permuted_axes(problem: Problem, dataset: Dataset) -> PermutedAxes | None:
-    """The first measurement whose positions, as they stand, do not fit, but do with one exchange undone.
-
-    The problem is of the dataset, its noise as declared.
-    """
+    """The first measurement whose positions, as they stand, do not fit, but do with one exchange undone; the problem is
+    of the dataset, its noise as declared."""
     for number, kernel in enumerate(problem.kernels):
         try:
-            seen = _seen(problem, dataset, number)
+            seen = _Seen.of(problem, dataset, number)
             arms = [problem.blueprint.arms[name] for name in problem.blueprint.measurements[kernel.factor.name].arms]
-            permuted = _of_contact(problem, number, arms) if seen is None else _of(problem, seen, arms[0])
+            permuted = _of_contact(problem, number, arms) if seen is None else seen.permuted(arms[0])
         except NotConvergedError:
             continue
         if permuted is not None:
@@ -393,17 +530,22 @@ def find_permuted_axes(problem: Problem, dataset: Dataset) -> PermutedAxes | Non
 
 
 def _of_contact(problem: Problem, number: int, arms: Sequence[Arm]) -> PermutedAxes | None:
-    """Of a contact: how far apart single records put what they touch together, by the nominal arm, however read."""
+    """Of a contact: how far single records put what they touch from its middle, by the nominal arm, however read."""
     kernel, own, nominal = problem.kernels[number], problem.records[number], problem.blueprint.parameters.nominal()
-    if kernel.factor.output_channels or not is_place(kernel.factor.nuisance_names):
+    if kernel.factor.output_channels or tuple(name[-1:] for name in kernel.factor.nuisance_names[:3]) != tuple(_AXES):
         return None
+    groups = np.zeros(own.count) if own.group is None else own.group[: own.count]
+    members = [np.flatnonzero(groups == group) for group in np.unique(groups[groups >= 0])]
 
     def left(read_as: Wires) -> float:
+        wired = problem.with_record(number, rewired(kernel.factor.channels, own, read_as))
         try:
-            wired = rewired(kernel.factor.channels, own, read_as)
-            return apart_in_groups(problem.with_record(number, wired), number, nominal)
+            starts = wired.grouped[number].nuisance_starts(nominal, wired.records[number])
         except NotConvergedError:
             return np.inf
+        parts = [starts[:3, chosen] for chosen in members]
+        away = [np.linalg.norm(part - np.median(part, axis=1, keepdims=True), axis=0) for part in parts]
+        return float(np.median(np.concatenate(away))) if away else np.inf
 
     reach = spread_of(tools(problem, nominal)[0][0])
     if not MISSES * reach < (as_given := left({})) < np.inf:
@@ -422,234 +564,7 @@ def _of_contact(problem: Problem, number: int, arms: Sequence[Arm]) -> PermutedA
     return PermutedAxes(kernel.factor.name, words, as_given * _MM, best.left * _MM, True, adapted=False)
 
 
-def _seen(problem: Problem, dataset: Dataset, number: int) -> _Seen | None:
-    """A measurement that gives positions in the base frame, at most so many records of it; None of another.
-
-    Records without both neighbours are left out, unless these are most.
-    """
-    sighting = sighting_of(problem, dataset, number, _MOST_RECORDS)
-    if sighting is None:
-        return None
-    every, rows = _neighbours(problem, dataset, sighting)
-    sighting = sighting.subset(every)
-    if 3 * len(sighting.chosen) < _EQUATIONS * max(problem.increments, 6):
-        return None
-    own = replace(problem.subset(sighting.chosen).records[number], whitening=None, correlation=None)
-    noise = np.array(problem.kernels[number].factor.noise[:3])
-    return _Seen(sighting, own, rows, None, noise, tuple(dataset.ids[i] for i in sighting.chosen))
-
-
-def _neighbours(
-    problem: Problem, dataset: Dataset, sighting: Sighting
-) -> tuple[Indices, tuple[tuple[str, Array], ...]]:
-    """Which of the records to look at, and what was measured one row before and after each of these (3 x n each)."""
-    channels = problem.kernels[sighting.kernel].factor.position_channels
-    lines = np.array(dataset.rows or range(len(dataset)))
-    whole = np.flatnonzero(problem.records[sighting.kernel].measured)
-    place, positions = {line: i for i, line in zip(whole, lines[whole], strict=True)}, dataset.stacked(channels)
-    beside = np.array([[place.get(lines[i] + step, -1) for i in sighting.chosen] for step in (-1, 1)])
-    both = np.flatnonzero((beside >= 0).all(axis=0))
-    if 2 * len(both) < len(sighting.chosen):
-        return np.arange(len(sighting.chosen)), ()
-    words = ("positions of the row before", "positions of the row after")
-    rows = ((w, positions[:, of[both]]) for w, of in zip(words, beside, strict=True))
-    return both, tuple((f"the {w} taken for each row's", moved) for w, moved in rows)
-
-
-def _of(problem: Problem, seen: _Seen, arm: Arm) -> PermutedAxes | None:
-    straight = _positions(problem, seen, {}, problem.parameters.nominal())
-    if straight is None:
-        return None
-    spread = max(spread_of(seen.measured), spread_of(straight.predicted))
-    as_given = straight.left(seen.measured)
-    if as_given > MISSES * spread:
-        placing = placings(problem, seen.sighting)[0]
-        seen = replace(seen, placing=placing if placing.stands_anywhere else None)
-        as_given = min(as_given, _left(problem, seen, {}, seen.measured, np.inf))
-    if as_given <= MISSES * spread:
-        return None
-    enough = min(FITS * spread, as_given / MUCH_BETTER)
-    readings = [*_single(problem, seen, arm, straight, enough), *_in_two_frames(problem, seen)]
-    explained = _explained(problem, seen, readings, enough)
-    if not explained:
-        if seen.placing is None:
-            turn, shift = rigid_fit(straight.predicted, seen.measured)
-            angle = float(np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
-            apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
-            words = f"the arm's base elsewhere by {apart}"
-            left = straight.left(turn.T @ (seen.measured - shift[:, None]))
-            read = _Reading(left, words, False, {}, turn.T @ (seen.measured - shift[:, None]))
-            explained = _explained(problem, seen, [read], enough)
-            if explained and straight.can_move(turn, shift):
-                return None  # the fit moves the base there by itself
-        if not explained:
-            few = seen.thinned(_SEVERAL_RECORDS)
-            if _left(problem, few, {}, few.measured, np.inf) <= MISSES * spread:
-                return None  # as they stand, the records that are looked at fit: a few others are off
-            explained = _explained(problem, few, list(_several(problem, few, arm, enough)), enough)
-    if not explained:
-        return None
-    (best, left), name = explained[0], problem.kernels[seen.sighting.kernel].factor.name
-    alike = [r.words for r, _ in explained if r.left <= _AS_GOOD * best.left and r.of_joints == best.of_joints]
-    return PermutedAxes(name, tuple(alike[:_MOST_NAMED]), as_given * _MM, left * _MM, best.of_joints)
-
-
-def _explained(
-    problem: Problem, seen: _Seen, readings: Sequence[_Reading], enough: float
-) -> list[tuple[_Reading, float]]:
-    """Readings that explain the records once they are fitted, the likeliest first, and what each then leaves (m).
-
-    Where a fit of the data as given comes nearly as near, none is needed.
-    """
-    likely = sorted((r for r in readings if r.left <= enough), key=lambda reading: reading.left)[:_FITTED]
-    if not likely:
-        return []
-    noise, explained = float(np.linalg.norm(seen.noise)), []
-    worse = _fitted(problem, seen, {}, seen.measured) / spread_of(seen.measured)
-    for reading in likely:
-        measured = reading.measured
-        left = reading.left if measured is None else _fitted(problem, seen, reading.read_as, measured)
-        spread = kept_spread(seen.measured if measured is None else measured, seen.measured)
-        share, better = _EXPLAINS if worse <= _HOPELESS else _EXPLAINS_HOPELESS
-        if left <= min(max(_NOISE * noise, share * spread), spread * worse / better):
-            explained.append((reading, left))
-    return explained
-
-
-def _fitted(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> float:
-    """What a short fit of a reading typically leaves (median, m); infinite where it leads far from the nominal arm."""
-    number = seen.sighting.kernel
-    values, measured, _ = _placed(problem, seen, read_as, measured)
-    some = [*problem.subset(seen.sighting.chosen).records]
-    some = [replace(one, weight=0 * one.weight, whitening=None, correlation=None) for one in some]
-    own = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
-    rows, unturned = np.zeros(len(problem.kernels[number].factor.noise)), np.tile(np.eye(3), (own.count, 1, 1))
-    rows[:3] = 1 / seen.noise
-    whitening = np.tile(np.diag(rows)[:, :, None], len(own.weight))
-    some[number] = replace(own, whitening=whitening)
-    problem = shown_instead(problem.with_records(some), number, Tools(measured, unturned))
-    posed = PosedProblem(problem)
-    try:
-        if problem.increments:
-            matters = np.diag(posed.model(posed.x(values)).hessian)
-            x = descended(posed, posed.x(values), _FIT_STEPS, _FIT_DAMPING, 1e-3)
-            if np.abs(x - posed.x(values))[matters > _DETERMINED * matters.max()].max(initial=0.0) > _FARTHEST:
-                return np.inf
-            values = posed.values(x)
-        return float(np.median(np.linalg.norm(problem.residuals(values)[number][:3], axis=0)))
-    except NotConvergedError:
-        return np.inf
-
-
-def _positions(problem: Problem, seen: _Seen, read_as: Wires, values: Array) -> Adapting | None:
-    """At these values, channels read as others, times a factor; None where a record has no equilibrium."""
-    number, parameters = seen.sighting.kernel, problem.parameters
-    records = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
-    try:
-        blocks = list(problem.grouped[number].linearised(values, records))
-    except NotConvergedError:
-        return None
-    noise, count = seen.noise[:, None], records.count
-    slopes, residual = (np.concatenate(parts, axis=-1)[:3, ..., :count] for parts in zip(*blocks, strict=True))
-    rows = (slopes * noise[:, :, None]).transpose(2, 0, 1).reshape(3 * count, -1)
-    rows = rows @ parameters.entries_jacobian(values) * parameters.scales()
-    basis, triangle = np.linalg.qr(rows)
-    ways, sizes, _ = np.linalg.svd(triangle, full_matrices=False)
-    kept = sizes > _SMALLEST * sizes.max(initial=0.0)
-    return Adapting(seen.measured - residual * noise, basis @ ways[:, kept], sizes[kept])
-
-
-def _placed(problem: Problem, seen: _Seen, read_as: Wires, measured: Array) -> tuple[Array, Array, float]:
-    """Values and positions in the base frame (3 x n) of a reading, base and target found anew, and what is left (m)."""
-    # As configured: where records that are mixed up put base and target says nothing of another reading of them.
-    placing, number, nominal = seen.placing, seen.sighting.kernel, problem.blueprint.parameters.nominal()
-    if placing is None:
-        return nominal, measured, 0.0
-    as_read = rewired(problem.kernels[number].factor.channels, seen.records, read_as)
-    alignment = nearest(tools_of(problem.with_record(number, as_read), nominal, number), measured, placing.basis)
-    values = placing.with_target(problem.parameters, nominal, alignment.offset)
-    return values, alignment.back(measured), alignment.left
-
-
-def _left(problem: Problem, seen: _Seen, read_as: Wires, measured: Array, enough: float) -> float:
-    """What a reading leaves where base and target are found anew: roughly, if that is far more than enough (m)."""
-    values, measured, left = _placed(problem, seen, read_as, measured)
-    if left > _ROUGHLY * enough:
-        return left
-    positions = _positions(problem, seen, read_as, values)
-    return np.inf if positions is None else positions.left(measured, enough)
-
-
-def _of_axes(seen: _Seen, straight: Adapting) -> Iterator[tuple[str, Array]]:
-    if seen.placing is not None:
-        yield LEFT_HANDED, np.diag([1.0, 1.0, -1.0]) @ seen.measured
-    else:
-        for words, turn in turned_axes():
-            if np.linalg.det(turn) < 0 or not straight.can_move(turn, np.zeros(3)):
-                yield words, turn @ seen.measured
-    for words, scale in scaled_positions():
-        yield words, scale @ seen.measured
-    yield from seen.rows
-
-
-def _single(problem: Problem, seen: _Seen, arm: Arm, straight: Adapting, enough: float = np.inf) -> Iterator[_Reading]:
-    size = spread_of(straight.predicted)
-    for words, measured in _of_axes(seen, straight):
-        left = straight.left(measured) if seen.placing is None else _left(problem, seen, {}, measured, enough)
-        yield _Reading(_as_spread(left, size, kept_spread(measured, seen.measured)), words, False, {}, measured)
-    spread = spread_of(seen.measured)
-    for words, read_as in [*single_joints(arm), *coupled_joints(arm)]:
-        left = _left(problem, seen, read_as, seen.measured, enough)
-        yield _Reading(_as_spread(left, size, spread), words, True, read_as, seen.measured)
-
-
-def _in_two_frames(problem: Problem, seen: _Seen) -> Iterator[_Reading]:
-    """The records from one on in another frame, where base and target are found for each part by itself."""
-    if seen.placing is None:
-        return
-    nominal = problem.blueprint.parameters.nominal()
-    number = seen.sighting.kernel
-    tools = tools_of(problem.with_record(number, seen.records), nominal, number)
-    apart = two_frames(tools, seen.measured, seen.placing.basis)
-    if apart is not None:
-        words = f"the positions from record {seen.ids[apart[1]]} on taken for those in another frame"
-        yield _Reading(apart[0], f"{words} (something moved there: calibrate both parts by themselves)", False)
-
-
-def _several(problem: Problem, seen: _Seen, arm: Arm, enough: float) -> Iterator[_Reading]:
-    """Signs of several joints, joints in another order, and either or one joint's permutation beside one of axes."""
-    straight = _positions(problem, seen, {}, problem.parameters.nominal())
-    if straight is None:
-        return
-    axes = [("", seen.measured), *((f" and {own}", moved) for own, moved in _of_axes(seen, straight))]
-    axes = axes if seen.placing is None else axes[:2]
-    size, measured = spread_of(straight.predicted), np.array([moved for _, moved in axes])
-    spreads = [kept_spread(moved, seen.measured) for moved in measured]
-    for words, read_as in [*single_joints(arm), *several_joints(arm)]:
-        if seen.placing is not None:
-            lefts = [_left(problem, seen, read_as, moved, enough) for moved in measured]
-        else:
-            positions = _positions(problem, seen, read_as, problem.parameters.nominal())
-            lefts = [] if positions is None else positions.left_of_each(measured, enough).tolist()
-        for left, spread, (own, moved) in zip(lefts, spreads, axes, strict=False):
-            yield _Reading(_as_spread(left, size, spread), f"{words}{own}", True, read_as, moved)
-
-
-def _as_spread(left: float, size: float, spread: float) -> float:
-    """What a reading leaves, as many times more as its positions are spread less than the arm's, of this ``size`` (m).
-
-    Measured ones near one point are near those of any arm. Infinite where it is no fit.
-    """
-    spread = max(spread, _SMALLEST)
-    return np.inf if left > FITS * spread else left * max(1.0, size / spread)
-
-
-_MEND = {
-    True: "the order, the directions or the zeros of the joints in the model",
-    False: "how the tracker's frame lies",
-}
-_STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}
-"""A joint that moved by less stood still, but for the noise of its reading."""
+_STILL = {"angle": ("deg", 1.0), "length": ("mm", 1.0)}  # What moved by less stood still, but for noise of its reading
 _ODD, _MUCH_LESS, _FAR_LIKELIER = 0.2, 1.4, np.log(1e3)
 """Of gravity: by how much it is another where it is meant in the base frame; how much larger residuals are without."""
 _DENSEST, _SHORTEST = 200.0, 0.4
@@ -663,26 +578,20 @@ def mixed_up(ready: Prepared) -> list[Finding]:
     adapted = "model, however its free parameters adapt" if reading.adapted else "nominal arm"
     text = (
         f"{reading.measurement}: as they stand, the data are typically {digits(reading.as_given_mm)} mm off the "
-        f"{adapted}; with {', or with '.join(reading.readings)}, they are "
-        f"{digits(reading.left_mm)} mm off."
+        f"{adapted}; with {', or with '.join(reading.readings)}, they are {digits(reading.left_mm)} mm off."
     )
-    mend = _MEND[reading.of_joints]
-    hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {mend}."
+    of_model = "the order, the directions or the zeros of the joints in the model"
+    of_model = of_model if reading.of_joints else "how the tracker's frame lies"
+    hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {of_model}."
     return [Finding("bad", text, f"limit {MUCH_BETTER:g} times", hint)]
 
 
 def reach(ready: Prepared) -> list[Finding]:
-    """Positions ten times farther out, or nearer, than the model's: a unit is wrong.
-
-    Raises:
-        DataError: which, and as which unit they are read.
-    """
     check_reach(ready.problem, ready.dataset)
     return []
 
 
 def masses(ready: Prepared) -> list[Finding]:
-    """Masses that no arm of that size has: grams that were read as kilograms."""
     findings = []
     for name, arm in ready.system.arms.items():
         total, size = sum(mass.mass for mass in arm.masses), max(arm.length, _SHORTEST)
@@ -739,23 +648,34 @@ def same_poses(fit: Fit) -> list[Finding]:
 
 
 def gravity(ready: Prepared) -> list[Finding]:
-    """Where springs bend under weights: whether gravity is stated, and in the frame of the measurements.
-
-    A tracker's frame may stand in any way. Where the base as aligned stands tilted in it, short fits judge whether the
-    vector was meant in the base frame.
-    """
-    system, dataset = ready.system, ready.dataset
+    """Where springs bend under weights: whether gravity is stated, and in the frame of the measurements, in which the
+    base may stand tilted: then short fits judge whether the vector was meant in the base frame."""
+    system, dataset, findings = ready.system, ready.dataset, list[Finding]()
     payload = bool(system.statics.payload) or (dataset.has("payload") and bool(dataset.column("payload").any()))
     bent = [name for name, arm in system.arms.items() if arm.deflection_size and (arm.masses or payload)]
     if not bent or dataset.has("gravity_z"):
         return []
     stated, alignment = np.array(system.environment.gravity), ready.start.alignment
-    findings = [] if system.statics.gravity is not None else [_unstated(bent, stated)]
+    if system.statics.gravity is None:
+        x, y, z = stated
+        text = f"The direction of gravity is not stated: for the springs of {', '.join(bent)} it was assumed to be "
+        text += f"({x:g}, {y:g}, {z:g}) m/s^2 in the frame of the measurements, z up. If that frame is tilted, "
+        action = "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and "
+        findings += [Finding("warning", f"{text}compliances are wrong.", "", f"{action}gravity_z_m_s2 to the records.")]
     if alignment is None or np.linalg.norm(alignment.turn @ stated - stated) < _ODD * np.linalg.norm(stated):
         return findings
     inside, meant = alignment.turn.T @ stated, alignment.turn @ stated
+    # What short fits leave under each, in units of the declared noise.
+    few, left, plan = ready.trained.subset(thinned(np.arange(len(ready.trained)))), [], ready.problem.blueprint
     try:
-        left, freedom = _left_under(ready, (stated, meant))
+        for vector in (stated, meant):
+            column = {f"gravity_{axis}": np.full(len(few), x) for axis, x in zip(_AXES, vector, strict=True)}
+            under = replace(few, channels={**few.channels, **column})
+            parts = plan.arms, plan.measurements, ready.problem.parameters, plan.environment, under
+            problem = Problem.build(*parts, "interpreted")
+            posed, freedom = PosedProblem(problem.of(under)), max(problem.equations() - problem.increments, 1)
+            x = descended(posed, posed.x(ready.start.values(problem)[0]), _FIT_STEPS, _FIT_DAMPING, 1e-3)
+            left.append(float(np.sqrt(2 * posed.cost(x) / freedom)))
     except NotConvergedError:
         return findings
     odds = freedom * np.log(left[0] / left[1])  # of two fits with noise of unknown size, in powers of e
@@ -769,26 +689,3 @@ def gravity(ready: Prepared) -> list[Finding]:
     grade: Grade = "bad" if likelier and left[0] > _MUCH_LESS * left[1] else "warning" if likelier else "note"
     action = f"{'State' if likelier else 'If it is meant so, state'} statics.gravity_m_s2: [{to_state}]."
     return [*findings, Finding(grade, text, f"limits {_MUCH_LESS:g} times, and a thousand to one", action)]
-
-
-def _unstated(bent: Sequence[str], assumed: Array) -> Finding:
-    x, y, z = assumed
-    text = f"The direction of gravity is not stated: for the springs of {', '.join(bent)} it was assumed to be "
-    text += f"({x:g}, {y:g}, {z:g}) m/s^2 in the frame of the measurements, z up. If that frame is tilted, compliances "
-    action = "State statics.gravity_m_s2 in that frame, or add the columns gravity_x_m_s2, gravity_y_m_s2 and "
-    return Finding("warning", f"{text}are wrong.", action=f"{action}gravity_z_m_s2 to the records.")
-
-
-def _left_under(ready: Prepared, directions: Sequence[Array]) -> tuple[list[float], float]:
-    """What short fits leave under each gravity (3, m/s^2), in units of the declared noise; degrees of freedom."""
-    few = ready.trained.subset(thinned(np.arange(len(ready.trained))))
-    columns = [{f"gravity_{axis}": np.full(len(few), x) for axis, x in zip("xyz", g, strict=True)} for g in directions]
-    under = [replace(few, channels={**few.channels, **own}) for own in columns]
-    plan, parameters = ready.problem.blueprint, ready.problem.parameters
-    problem = Problem.build(plan.arms, plan.measurements, parameters, plan.environment, under[0], "interpreted")
-    freedom, left = max(problem.equations() - problem.increments, 1), []
-    for dataset in under:
-        posed = PosedProblem(problem.of(dataset))
-        x = descended(posed, posed.x(ready.start.values(problem)[0]), _FIT_STEPS, _FIT_DAMPING, 1e-3)
-        left.append(float(np.sqrt(2 * posed.cost(x) / freedom)))
-    return left, freedom

@@ -4,9 +4,8 @@ A check, a table or a figure asks a fit for an analysis (``fit.of(structure)``);
 
 As rows it gives covariances that hold where records which follow one another err alike. Errors of neighbours are taken
 for an independent part beside one that falls by e over some records, both by restricted maximum likelihood
-[Patterson1971], which counts what the fit took out of the residuals. An estimate is a weighted sum of the records'
-errors, and so its covariance is the sandwich of the weights and those of all pairs [Liang1986]. In random order poses
-weigh correlated errors with changing signs, and little is wider; along a path it is.
+[Patterson1971]. An estimate is a weighted sum of the records' errors, and so its covariance is the sandwich of the
+weights and those of all pairs [Liang1986]: in random order little is wider, along a path it is.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from armcal.estimate.validation import (
     record_errors,
 )
 from armcal.problem.motion import Motion, recorded_position
-from armcal.problem.problem import FactorRecords, PosedProblem, Problem
+from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 from armcal.problem.variants import with_few_points
 
@@ -86,21 +85,13 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fit to training records.
+    """A fit to training records."""
 
-    Attributes:
-        ready: its problem, dataset, split and folds.
-        fitted: the estimate, and how the training records weighed.
-        estimator: that made it.
-        crossed: what the folds say of the records that they held out; None if there were none.
-        before: the fit without the pose residual that this one has learned; None where none is.
-    """
-
-    ready: Prepared
-    fitted: WeighedFit
-    estimator: Estimator
-    crossed: CrossValidation | None = None
-    before: Fit | None = None
+    ready: Prepared  # its problem, dataset, split and folds
+    fitted: WeighedFit  # the estimate, and how the training records weighed
+    estimator: Estimator  # that made it
+    crossed: CrossValidation | None = None  # what the folds say of the records that they held out, if there are any
+    before: Fit | None = None  # without the pose residual that this one has learned; None where none is
     _kept: dict[Callable[[Fit], Any], Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def of(self, analysis: Callable[[Fit], T]) -> T:
@@ -155,7 +146,6 @@ class Fit:
 
     @cached_property
     def motion(self) -> Motion:
-        """How all records move with joints and loads."""
         return Motion.of(self.few, self.estimate.values, self.dataset)
 
     @cached_property
@@ -183,18 +173,39 @@ class Fit:
         Raises:
             NotConvergedError: a record has no elastic equilibrium at the estimate.
         """
+        problem, values, crossed = self.problem, self.estimate.values, self.crossed
+        judged = np.full((3, len(self.dataset)), np.nan)  # of lengths, at rest, and of turns
+        if crossed is not None:
+            for row, own in zip(judged, (crossed.errors, crossed.at_rest, crossed.turns), strict=True):
+                row[self.split.train] = np.nan if own is None else own
         try:
-            return _errors(self)
+            nominal, nominal_crossed, rival, residual = _nominal(self.before or self, crossed is not None)
+            after = _of_both(problem, values, self.fitted.problem)
+            left = problem.residuals_beside(self.fitted.problem, settled(problem, values))
+            turned = (nominal[1], after[1], judged[2], nominal_crossed[1], rival[1])
+            return RecordErrors(
+                nominal_mm=nominal[0] * _MM,
+                calibrated_mm=after[0] * _MM,
+                cross_validated_mm=judged[0] * _MM,
+                nominal_residual_mm=_measured(residual, problem) * _MM,
+                calibrated_residual_mm=_measured(left, problem) * _MM,
+                position_mm=problem.predict(values)[0].tools[0, 3] * _MM,
+                nominal_crossed_mm=nominal_crossed[0] * _MM,
+                rival_mm=rival[0] * _MM,
+                at_rest_mm=record_errors(problem, values) * _MM if self.drifts else None,
+                cross_validated_at_rest_mm=judged[1] * _MM if self.drifts else None,
+                residual_columns=_columns(problem),
+                unit=self.unit,
+                name=self.name,
+                turns=TurnErrors(*map(np.degrees, turned)) if measures_turns(problem) else None,
+            )
         except NotConvergedError as fault:
             raise fault if self.converged else gave_up(self.estimate.verdict) from fault
 
     @cached_property
     def unseen_mm(self) -> Array:
-        """Errors of records by fits that did not see them: held-out and cross-validated ones (N; nan elsewhere).
-
-        Where something drifts they are those of a new recording, as ``predict`` takes its poses to be: the drift of
-        this one, which its neighbours show, is of no help there.
-        """
+        """Errors of records by fits that did not see them: held-out and cross-validated ones (N; nan elsewhere). Where
+        something drifts they are those of a new recording, as ``predict`` takes its poses to be."""
         after, crossed = self.errors.at_rest_mm, self.errors.cross_validated_at_rest_mm
         if after is None or crossed is None:
             after, crossed = self.errors.calibrated_mm, self.errors.cross_validated_mm
@@ -209,10 +220,6 @@ class Fit:
         if len(self.split.holdout):
             judged[self.split.train] = np.nan
         return judged
-
-    @property
-    def trained_on(self) -> tuple[str, ...]:
-        return self.ready.trained.ids
 
     @cached_property
     def spent(self) -> float:
@@ -237,24 +244,19 @@ class TurnErrors:
 class RecordErrors:
     """Error of each record of the dataset, in dataset order: in mm, or in ``unit`` where nothing measured is a length.
 
-    Attributes:
-        nominal_mm: of the nominal arm as it is shown: where the configuration has it, or placed by the training records
-            where nobody configured where it stands, or what it carries (N).
-        nominal_crossed_mm: the same, what is cross-validated by the placement of the fold that did not train on it.
-        rival_mm: what a calibration is compared with, placed by the records that train, of records that do not (N); nan
-            of others, and of all where nothing is free but what places the arm.
-        at_rest_mm: with the calibrated parameters where nothing is known of a drift (N); None if nothing drifts.
+    Of the nominal arm as it is shown: where the configuration has it, or placed by the training records where nobody
+    configured where it stands, or what it carries.
     """
 
-    nominal_mm: Array
+    nominal_mm: Array  # of the nominal arm as it is shown (N)
     calibrated_mm: Array  # with the calibrated parameters (N)
     cross_validated_mm: Array  # by the fold that did not train on it (N; nan outside of cross-validation)
     nominal_residual_mm: Array  # measured minus predicted, all factors stacked (n_r x N)
     calibrated_residual_mm: Array  # the same after calibration
     position_mm: Array  # predicted tool position of the first arm in its base frame (3 x N)
-    nominal_crossed_mm: Array
-    rival_mm: Array
-    at_rest_mm: Array | None = None
+    nominal_crossed_mm: Array  # nominal, what is cross-validated by the placement of the fold that did not train on it
+    rival_mm: Array  # of records that do not train, the nominal arm placed by those that do; nan where that is all
+    at_rest_mm: Array | None = None  # calibrated, where nothing is known of a drift (N); None if nothing drifts
     cross_validated_at_rest_mm: Array | None = None  # the same by the fold that did not train on it
     residual_columns: tuple[str, ...] = ()  # names of the rows of the residuals, with their units (mm; mrad for angles)
     unit: str = "mm"  # of all errors, ``mm`` or ``mrad``
@@ -285,34 +287,6 @@ def unconfigured(problem: Problem, name: str) -> bool:
     return tuple(block.nominal) in ((0.0,) * block.size, NO_TURN, (*NO_TURN, 0.0, 0.0, 0.0))
 
 
-def _errors(fit: Fit) -> RecordErrors:
-    problem, values, crossed = fit.problem, fit.estimate.values, fit.crossed
-    judged = np.full((3, len(fit.dataset)), np.nan)  # of lengths, at rest, and of turns
-    if crossed is not None:
-        for row, own in zip(judged, (crossed.errors, crossed.at_rest, crossed.turns), strict=True):
-            row[fit.split.train] = np.nan if own is None else own
-    nominal, nominal_crossed, rival, residual = _nominal(fit.before or fit, crossed is not None)
-    after = _of_both(problem, values, fit.fitted.problem)
-    turned = (nominal[1], after[1], judged[2], nominal_crossed[1], rival[1])
-    left = problem.residuals_beside(fit.fitted.problem, settled(problem, values))
-    return RecordErrors(
-        nominal_mm=nominal[0] * _MM,
-        calibrated_mm=after[0] * _MM,
-        cross_validated_mm=judged[0] * _MM,
-        nominal_residual_mm=_known(residual, problem) * _MM,
-        calibrated_residual_mm=_known(left, problem) * _MM,
-        position_mm=problem.predict(values)[0].tools[0, 3] * _MM,
-        nominal_crossed_mm=nominal_crossed[0] * _MM,
-        rival_mm=rival[0] * _MM,
-        at_rest_mm=record_errors(problem, values) * _MM if fit.drifts else None,
-        cross_validated_at_rest_mm=judged[1] * _MM if fit.drifts else None,
-        residual_columns=_columns(problem),
-        unit=fit.unit,
-        name=fit.name,
-        turns=TurnErrors(*map(np.degrees, turned)) if measures_turns(problem) else None,
-    )
-
-
 def _of_both(problem: Problem, values: Array, training: Problem | None = None) -> Array:
     """Errors of lengths (m) and of orientations (rad; nan where none are measured) (2 x N)."""
     errors, turns = errors_and_turns(problem, values, training)
@@ -320,12 +294,14 @@ def _of_both(problem: Problem, values: Array, training: Problem | None = None) -
 
 
 def _nominal(fit: Fit, by_folds: bool) -> tuple[Array, Array, Array, Sequence[Array]]:
-    """Errors of the nominal arm (2 x N each), as ``_of_both`` has them, and its residuals.
-
-    As shown, cross-validated, and as the rival of a calibration; see ``RecordErrors``.
-    """
+    """Errors of the nominal arm (2 x N each), as ``_of_both`` has them, as shown, cross-validated, and as the rival of
+    a calibration, and its residuals; see ``RecordErrors``."""
     problem, train, held = fit.problem, fit.split.train, fit.split.holdout
-    names = _placing_names(fit.acting)
+    some = fit.acting.subset(thinned(np.arange(fit.acting.count), _POSES))
+    blocks, configured = some.parameters.coordinate_blocks, some.parameters.nominal()
+    moving = {b.name for i, b in enumerate(blocks) if not b.nuisance and not only_places(some, configured, i)}
+    free = {block.name for block in some.parameters.free if not block.nuisance}
+    names = free - moving
     shown, values = _placed(fit.acting, names, problem.parameters.nominal())
     errors = _of_both(shown.with_records(problem.records), values)
     rival = np.full(errors.shape, np.nan)
@@ -334,21 +310,18 @@ def _nominal(fit: Fit, by_folds: bool) -> tuple[Array, Array, Array, Sequence[Ar
         fold, there = _placed(fit.acting.subset(split.train), names, values)
         judged = train[split.holdout]
         rival[:, judged] = _of_both(fold.with_records(problem.subset(judged).records), there)
-    crossed = rival
-    if not _found(fit, names, errors[0]):
+    crossed, taken = rival, fit.ready.start.taken
+    if not taken and any(unconfigured(problem, name) for name in names):
+        # Whether the records say where the arm stands, or what it carries, since nobody configured it.
+        as_configured = errors_and_turns(untrained(problem), problem.parameters.nominal())[0]
+        taken = bool(np.nanmedian(errors[0]) * BETTER < np.nanmedian(as_configured))
+    if not taken:
         shown, values = untrained(problem), problem.parameters.nominal()
         errors = crossed = _of_both(shown, values)
     residual = problem.residuals(settled(shown.with_records(problem.records), values))
     if {block.name for block in problem.parameters.free if not block.nuisance} == names:
         rival = np.full(rival.shape, np.nan)
     return errors, crossed, rival, residual
-
-
-def _placing_names(problem: Problem) -> set[str]:
-    some = problem.subset(thinned(np.arange(problem.count), _POSES))
-    blocks, nominal = problem.parameters.coordinate_blocks, problem.parameters.nominal()
-    moving = {b.name for i, b in enumerate(blocks) if not b.nuisance and not only_places(some, nominal, i)}
-    return {block.name for block in problem.parameters.free if not block.nuisance} - moving
 
 
 def _placed(problem: Problem, names: set[str], start: Array) -> tuple[Problem, Array]:
@@ -363,16 +336,7 @@ def _placed(problem: Problem, names: set[str], start: Array) -> tuple[Problem, A
         return own, start
 
 
-def _found(fit: Fit, names: set[str], placed: Array) -> bool:
-    """Whether the records say where the arm stands, or what it carries, since nobody configured it."""
-    problem, taken = fit.problem, fit.ready.start.taken
-    if taken or not any(unconfigured(problem, name) for name in names):
-        return taken
-    configured = errors_and_turns(untrained(problem), problem.parameters.nominal())[0]
-    return bool(np.nanmedian(placed) * BETTER < np.nanmedian(configured))
-
-
-def _known(raw: Sequence[Array], problem: Problem) -> Array:
+def _measured(raw: Sequence[Array], problem: Problem) -> Array:
     """Residuals of all measurements, one below the other (n_r x N), those of points that a record lacks unknown."""
     pairs = zip(raw, problem.records, strict=True)
     return np.vstack(
@@ -382,25 +346,23 @@ def _known(raw: Sequence[Array], problem: Problem) -> Array:
 
 def _columns(problem: Problem) -> tuple[str, ...]:
     """What the rows of the residuals are called, with their units: by axis, by number, or by point where many."""
-    if [dimension for kernel in problem.kernels for dimension in kernel.factor.dimensions] == ["length"] * 3:
+    factors, columns = [kernel.factor for kernel in problem.kernels], list[str]()
+    if [dimension for factor in factors for dimension in factor.dimensions] == ["length"] * 3:
         return ("dx_mm", "dy_mm", "dz_mm")
-    columns: list[str] = []
-    for kernel in problem.kernels:
-        factor = kernel.factor
-        names = [channel.rpartition(".")[2] for channel in factor.output_channels] if factor.points is not None else []
-        start = len(columns) + 1
-        for i, dimension in enumerate(factor.dimensions):
-            columns.append(f"residual{f'_{names[i]}' if names else start + i}_{ERROR_UNITS[dimension]}")
+    for factor in factors:
+        numbers = [str(len(columns) + 1 + i) for i in range(len(factor.dimensions))]
+        if factor.points is not None:
+            numbers = [f"_{channel.rpartition('.')[2]}" for channel in factor.output_channels]
+        units = (ERROR_UNITS[dimension] for dimension in factor.dimensions)
+        columns += [f"residual{number}_{unit}" for number, unit in zip(numbers, units, strict=False)]
     return tuple(columns)
 
 
 @dataclass(frozen=True)
 class FitRows:
-    """A fit as rows: whitened data factor by factor, then ties of groups, priors, and innovations of a drift.
-
-    Without the ties, known distances of sockets, an arm could change its size: that moves residuals of a contact in
-    proportion to themselves, and would take up all of them.
-    """
+    """A fit as rows: whitened data factor by factor, then ties of groups, priors, and innovations of a drift. Without
+    the ties, known distances of sockets, an arm could change its size: that moves residuals of a contact in proportion
+    to themselves, and would take up all of them."""
 
     slopes: Array  # by coordinates, and by innovations (rows x n)
     residual: Array  # at the solution (rows)
@@ -412,39 +374,40 @@ class FitRows:
 
     @classmethod
     def of(cls, problem: Problem, estimate: Estimate) -> Self:
-        values, parameters = estimate.values, problem.parameters
-        count, scales = problem.count, parameters.scales()
+        values, parameters, count = estimate.values, problem.parameters, problem.count
+        scales = parameters.scales()
         chain = parameters.entries_jacobian(values) * scales
         parts = [np.einsum("rvn,vc->rnc", block, chain) for block in problem.jacobians(values)]
-        weighted, shared = problem.weighted_residuals(values), problem.correlation
-        drifted = [np.zeros((*r.shape, 0)) for r in weighted] if shared is None else shared.shared()
-        drifted = [slope[:, :count] for slope in drifted]
-        drift = np.zeros(0)
+        weighted, shared, drift = problem.weighted_residuals(values), problem.correlation, np.zeros(0)
+        drifted = [np.zeros((*r.shape, 0)) for r in weighted]
         if shared is not None:  # its most likely innovations
+            drifted = [slope[:, :count] for slope in shared.shared()]
             by_drift = np.vstack([slope.reshape(-1, slope.shape[2]) for slope in drifted])
             off = by_drift.T @ np.concatenate([residual.ravel() for residual in weighted])
             drift = -np.linalg.solve(np.eye(len(off)) + by_drift.T @ by_drift, off)
-        data, slopes = [], []
+        data, slopes, whitening = [], [], []
         for residual, part, slope in zip(weighted, parts, drifted, strict=True):
             data.append((residual + slope @ drift).ravel())
             slopes.append(np.concatenate([part, slope], axis=2).reshape(residual.size, -1))
         prior = np.sqrt(parameters.prior_information())
         moved = prior * parameters.coordinates(parameters.local(values))
-        held, kept = np.flatnonzero(prior), len(scales)
+        held, kept, tied = np.flatnonzero(prior), len(scales), problem.tie_rows(values)
         below = np.zeros((len(held) + len(drift), kept + len(drift)))
         below[np.arange(len(held)), held] = (prior * scales)[held]
         below[len(held) :, kept:] = np.eye(len(drift))
-        tied = problem.tie_rows(values)
         ties = np.hstack([tied.jacobian @ chain, np.zeros((len(tied.residual), len(drift)))])
-        sizes = [len(residual) for residual in weighted]
-        numbers = np.arange(sum(sizes) * count).reshape(sum(sizes), count)
+        size = sum(map(len, weighted))
         pairs = [(grouped.kernel.factor, record) for grouped, record in problem.pairs]
+        for factor, own in pairs:
+            root = np.sqrt(own.weight[: own.count])
+            plain = np.diag(1 / np.array(factor.noise))[:, :, None]
+            whitening.append((plain if own.whitening is None else own.whitening[:, :, : own.count]) * root)
         return cls(
             np.vstack([*slopes, ties, below]),
             np.concatenate([*data, tied.residual, moved[held], drift]),
-            np.tile(np.arange(count), sum(sizes)),
-            numbers.T,
-            tuple(_whitening(factor.noise, record) for factor, record in pairs),
+            np.tile(np.arange(count), size),
+            np.arange(size * count).reshape(size, count).T,
+            tuple(whitening),
             tuple(record.points_of(factor).astype(float) for factor, record in pairs),
             tuple(is_position(kernel) for kernel in problem.kernels),
         )
@@ -458,21 +421,16 @@ class FitRows:
         below = np.zeros((len(self.residual) - len(self.record_of), parts[0].shape[1]))
         return np.vstack([*parts, below])
 
-    def mean_error(self, residual: Array) -> float:
-        return float(np.mean(self.errors(residual)))
-
     def errors(self, residual: Array) -> Array:
         """The length of each record's (N, m); of a pose's, that of its position."""
-        squares, place, count = [], 0, len(self.by_record)
+        squares, place = [], 0
         for whitening, points, position in zip(self.whitening, self.points, self.positions, strict=True):
-            size = len(whitening)
+            size, count = len(whitening), len(self.by_record)
             own = residual[place : place + size * count].reshape(size, count)
             counted = np.flatnonzero(np.abs(np.linalg.det(np.moveaxis(whitening, 2, 0))) > 0)
-            raw = np.zeros_like(own)
-            inverse = np.linalg.inv(np.moveaxis(whitening[:, :, counted], 2, 0))
+            raw, inverse = np.zeros_like(own), np.linalg.inv(np.moveaxis(whitening[:, :, counted], 2, 0))
             raw[:, counted] = np.einsum("nrs,sn->rn", inverse, own[:, counted])
-            own = raw[: len(POSITION)] if position else raw
-            squares.append(np.sum(own**2, axis=0) / np.maximum(points, 1))
+            squares.append(np.sum((raw[: len(POSITION)] if position else raw) ** 2, axis=0) / np.maximum(points, 1))
             place += size * count
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
@@ -483,15 +441,7 @@ def sampled_rows(fit: Fit) -> tuple[Problem, FitRows]:
     return problem, FitRows.of(problem, fit.estimate)
 
 
-def _whitening(noise: Sequence[float], records: FactorRecords) -> Array:
-    """What makes raw residuals rows (n_r x n_r x N)."""
-    root = np.sqrt(records.weight[: records.count])
-    if records.whitening is not None:
-        return np.asarray(records.whitening[:, :, : records.count] * root)
-    return np.asarray(np.diag(1 / np.array(noise))[:, :, None] * root)
-
-
-SEEN = 0.05  # A direction that the fit takes up but for so much of its length is the model's own
+_SEEN = 0.05  # A direction that the fit takes up but for so much of its length is the model's own
 SMALLEST = 1e-300
 _FEWEST_PAIRS = 10
 _DRAWS = 299  # Of noise: how neighbours of residuals without likeness correlate
@@ -504,24 +454,19 @@ def basis_of(slopes: Array) -> Array:
 
 
 def own_basis(columns: Array, basis: Array) -> tuple[Array, Array]:
-    """What of some columns (rows x k) is not in a basis: an orthonormal basis of it, and coefficients that give it.
-
-    Directions of which the basis holds almost everything are left out.
-    """
+    """What of some columns (rows x k) a basis hardly holds: an orthonormal basis of it, and its coefficients."""
     lengths = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(lengths > 0, lengths, 1.0)
     left = unit - basis @ (basis.T @ unit)
     values, vectors = np.linalg.eigh(left.T @ left)
-    seen = values > SEEN**2
+    seen = values > _SEEN**2
     coefficients = vectors[:, seen] / np.sqrt(values[seen])
     return left @ coefficients, coefficients / np.where(lengths > 0, lengths, 1.0)[:, None]
 
 
 def lag_one(both: Array, by_record: Indices, neighbours: Mask) -> tuple[float, Array]:
-    """How the first of some residuals (rows x m) correlates with its neighbours, beyond what chance, the others, does.
-
-    And the p-value of each (m): 1 where there are too few ``neighbours`` (N - 1: whether the next record is one).
-    """
+    """How the first of some residuals (rows x m) correlates with its neighbours, beyond what chance, the others, does;
+    and the p-value of each (m): 1 where there are too few ``neighbours`` (N - 1: whether the next record is one)."""
     first = np.flatnonzero(neighbours)
     if len(first) < _FEWEST_PAIRS:
         return 0.0, np.ones(both.shape[1])
@@ -533,9 +478,9 @@ def lag_one(both: Array, by_record: Indices, neighbours: Mask) -> tuple[float, A
 
 
 LEVEL = 0.05
-MATTERS = 1.1  # Standard deviations that grow by less are left as they are
+_MATTERS = 1.1  # Standard deviations that grow by less are left as they are
 FEWEST_RECORDS = 30
-LEAST_LEFT = 1e-3
+_LEAST_LEFT = 1e-3
 _MOST_RECORDS, _MOST_FITTED = 1000, 300
 _SHARES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.98)
 _DISTANCES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
@@ -544,10 +489,8 @@ _DISTANCES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 def widened(problem: Problem, estimate: Estimate, position: Indices) -> Estimate:
     """The estimate with the wider covariance where neighbouring residuals correlate (5 %), and it is wider by a tenth.
 
-    Args:
-        problem: of the records that were fitted, with the weights they had.
-        estimate: what it found.
-        position: how many of all records were recorded before each (N).
+    The problem is of the records that were fitted, with their weights; ``position`` is how many of all records were
+    recorded before each (N).
     """
     estimate, problem = _of_alike_points(problem, estimate), with_few_points(problem)
     taking_part = np.any([record.weight[: record.count] > 0 for record in problem.records], axis=0)
@@ -555,32 +498,28 @@ def widened(problem: Problem, estimate: Estimate, position: Indices) -> Estimate
     chosen = chosen[np.argsort(position[chosen], kind="stable")][:_MOST_RECORDS]
     if len(chosen) < FEWEST_RECORDS or not estimate.names or not estimate.verdict.converged:
         return estimate
-    rows, place = FitRows.of(problem.subset(chosen), estimate), position[chosen]
+    rows, place, count = FitRows.of(problem.subset(chosen), estimate), position[chosen], problem.increments
     basis = basis_of(rows.slopes)
     noise = np.random.default_rng(0).normal(size=(len(rows.residual), _DRAWS))
     both = np.column_stack([rows.residual, noise])
     if lag_one(both - basis @ (basis.T @ both), rows.by_record, np.diff(place) == 1)[1][0] > LEVEL:
         return estimate
-    shared = _shared(rows, place, estimate.noise_scale, problem.increments)
+    shared = _shared(rows, place, estimate.noise_scale, count)
     chain = problem.parameters.entries_jacobian(estimate.values) * problem.parameters.scales()
-    sums = np.vstack([np.eye(problem.increments), chain]) @ np.linalg.pinv(rows.slopes)[: problem.increments]
+    sums = np.vstack([np.eye(count), chain]) @ np.linalg.pinv(rows.slopes)[:count]
     own, of_priors = sums[:, rows.by_record], np.sum(sums[:, len(rows.record_of) :] ** 2, axis=1)
     apart, scale = np.sum(own**2, axis=(1, 2)), estimate.noise_scale**2
     together = np.einsum("jir,ik,jkr->j", own, shared, own, optimize=True)
     # The part of priors does not grow.
     whole = np.maximum(scale * apart + of_priors, 1e-300)
     factors = np.sqrt(1 + scale * np.maximum(together - apart, 0.0) / whole)
-    judged = replace(estimate, widened=estimate.widened or ())
-    return _wider(judged, factors[: problem.increments], factors[problem.increments :])
+    return _wider(replace(estimate, widened=estimate.widened or ()), factors[:count], factors[count:])
 
 
 def _of_alike_points(problem: Problem, estimate: Estimate) -> Estimate:
-    """The estimate with the wider covariance where the points of a record err alike, as by a lens or a detector.
-
-    By one factor, the mean over all combinations of parameters: that of the sandwich of the weights and of the own
-    products of residuals within each record, each residual divided by the root of what the fit left of it [Bell2002].
-    Factors of their own would undo that parameters which correlate hardly matter together.
-    """
+    """The estimate with the wider covariance where the points of a record err alike, as by a lens or a detector: by the
+    sandwich of the weights and of the own products of residuals within each record [Bell2002], as one factor, the mean
+    over all combinations. Factors of their own would undo that parameters which correlate hardly matter together."""
     if all(kernel.factor.points is None for kernel in problem.kernels) or not estimate.names:
         return estimate
     rows = FitRows.of(problem, estimate)
@@ -594,18 +533,16 @@ def _of_alike_points(problem: Problem, estimate: Estimate) -> Estimate:
 
 
 def unbiased_roots(rows: FitRows, basis: Array) -> Iterator[tuple[Indices, Array]]:
-    """Rows of each record, and what multiplies their residuals so that they vary as errors do (symmetric).
-
-    The inverse root of what a fit leaves of them that takes up an orthonormal ``basis``. [Bell2002]
-    """
+    """Rows of each record, and what multiplies their residuals so that they vary as errors do (symmetric): the inverse
+    root of what a fit leaves of them that takes up an orthonormal ``basis``. [Bell2002]"""
     for own in rows.by_record:
         values, axes = np.linalg.eigh(np.eye(len(own)) - basis[own] @ basis[own].T)
-        yield own, (axes / np.sqrt(np.maximum(values, LEAST_LEFT))) @ axes.T
+        yield own, (axes / np.sqrt(np.maximum(values, _LEAST_LEFT))) @ axes.T
 
 
 def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimate:
     """The estimate with standard deviations so many times as large; as it is where hardly any grows."""
-    if by_entry.max(initial=1.0) < MATTERS:
+    if by_entry.max(initial=1.0) < _MATTERS:
         return estimate
     return replace(
         estimate,
@@ -616,16 +553,13 @@ def _wider(estimate: Estimate, by_coordinate: Array, by_entry: Array) -> Estimat
 
 
 def _correlation(place: Indices, share: float, distance: float) -> Array:
-    """Of the errors of records (N x N)."""
     apart = np.abs(place[:, None] - place[None, :])
     return np.asarray((1 - share) * (apart == 0) + share * np.exp(-apart / distance))
 
 
 def _shared(rows: FitRows, place: Indices, noise_scale: float, parameters: int) -> Array:
-    """The likeliest covariance of the errors of records (N x N), in squares of the noise scale, of a grid of shares.
-
-    Of the columns the first ones are the parameters', the others a drift's.
-    """
+    """The likeliest covariance of the errors of records (N x N), in squares of the noise scale, of a grid of shares. Of
+    the columns the first ones are the parameters', the others a drift's."""
     first, drifts = rows.by_record[:_MOST_FITTED], rows.slopes.shape[1] - parameters
     slopes, residual = rows.slopes[first] / noise_scale, rows.residual[first] / noise_scale
     residual = residual - slopes[:, :, parameters:] @ rows.residual[len(rows.residual) - drifts :]

@@ -4,8 +4,8 @@ Some records contradict the others: a fit to the majority leaves them far off, a
 touches stay where it was? A socket that moved splits its residuals in two, in recorded order.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import betainc, chdtri
@@ -17,11 +17,10 @@ from armcal.diagnose.checks import Finding, first_few
 from armcal.diagnose.coverage import whitened_like
 from armcal.diagnose.fit import Fit, FitRows, sampled_rows, thinned
 from armcal.estimate.polish import settled
-from armcal.estimate.robust import LEVEL, SMALLEST_SCALE, Distances, WeighedFit, studentised_distances
+from armcal.estimate.robust import LEVEL, SMALLEST_SCALE, Distances, studentised_distances
 from armcal.estimate.validation import error_dimension
 from armcal.estimate.variance import VarianceComponents
 from armcal.measure.groups import group_key
-from armcal.problem.problem import Problem
 from armcal.problem.records import noise_roots
 
 UNUSUAL = 0.95  # What is above this share of all records is unusual
@@ -32,11 +31,7 @@ _CHANCE = 0.05
 
 @dataclass(frozen=True)
 class Miss:
-    """One record beyond the limit.
-
-    Attributes:
-        record_id, row: which it is.
-    """
+    """One record beyond the limit."""
 
     record_id: str
     row: int
@@ -59,11 +54,9 @@ class LargeErrors:
 
 
 def noise_of(fit: Fit) -> tuple[Array, float]:
-    """How far noise, as records state it, puts each off (N; SI), and of how many independent numbers that is.
-
-    Noise of joints is larger the farther out the arm reaches, and moves it along some directions more than along
-    others. More than three numbers, as of an image, are off together.
-    """
+    """How far noise, as records state it, puts each off (N; SI), and of how many independent numbers that is. Noise of
+    joints is larger the farther out the arm reaches, and moves it along some directions more than along others. More
+    than three numbers, as of an image, are off together."""
     problem = fit.few
     counted, count = error_dimension(problem), problem.count
     total, squares = np.zeros((2, count))
@@ -88,14 +81,10 @@ def distances(fit: Fit) -> Distances:
 
 
 def large_errors(fit: Fit) -> LargeErrors | None:
-    """Which records lie beyond the limit, and what is unusual about them; None if none was judged.
-
-    Under a loss, what it made of the training records is in ``suspect_findings``.
-    """
+    """Which records lie beyond the limit, and what is unusual about them; None if none was judged."""
     if not fit.converged:
         return None
-    stated, errors = fit.ready.limit_mm, fit.judged_mm
-    far = fit.of(distances)
+    stated, errors, far = fit.ready.limit_mm, fit.judged_mm, fit.of(distances)
     if stated is not None:
         times = errors / stated
     else:
@@ -108,38 +97,36 @@ def large_errors(fit: Fit) -> LargeErrors | None:
         return None
     missed = np.flatnonzero(known & (times > 1))
     missed = missed[np.argsort(-times[missed], kind="stable")]
-    leverage = _above(np.sum(far.leverages, axis=0))
+    leverage, turns = _above(np.sum(far.leverages, axis=0)), fit.errors.turns
     efforts = {name: _above(np.abs(loads.efforts)) for name, loads in fit.motion.loads.items()}
     residual = np.vstack(fit.few.residuals(fit.estimate.values))  # raw, in one sign convention
-    lengths = np.linalg.norm(residual, axis=0)
-
-    def explained(record: int) -> Miss:
+    lengths, explained = np.linalg.norm(residual, axis=0), []
+    for record in map(int, missed[:MOST_EXPLAINED]):
         beside = np.abs(fit.position - fit.position[record]) == 1
         same = residual[:, record] @ residual > _ALIKE * lengths[record] * lengths
-        alike = bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))
-        far_out, heavy = leverage[record] > UNUSUAL, _heaviest(record, fit, efforts)
+        alike = bool(beside.any() and np.all((same & (lengths >= np.median(lengths)))[beside]))  # and not by little
+        far_out, loaded = leverage[record] > UNUSUAL, next(_heavy(record, fit, efforts), "")
         reasons = [
             "its prediction is among the 5 % that depend most on the parameters' uncertainty" if far_out else "",
-            heavy,
-            "its neighbours in the recording miss in the same direction" if alike else "",  # and not by little
+            loaded,
+            "its neighbours in the recording miss in the same direction" if alike else "",
             _along(record, fit, residual[:, record]),
         ]
         advice = "measure it again: it may be a single wrong measurement"
         if alike:
             advice = "measure this pose again, at another time and coming from elsewhere"
-        elif far_out or heavy:
+        elif far_out or loaded:
             advice = "measure more poses like it"
-        unusual = tuple(filter(None, reasons)) or ("nothing is unusual about the pose",)
-        row, turned = fit.dataset.rows[record] if fit.dataset.rows else 0, None
-        if (turns := fit.errors.turns) is not None:
+        turned = None
+        if turns is not None:
             judged = turns.cross_validated_deg[record]
             turned = float(judged if np.isfinite(judged) else turns.calibrated_deg[record])
-        whole = float(errors[record]), turned, float(times[record])
-        return Miss(fit.dataset.ids[record], row, *whole, unusual, advice)
-
+        row, unusual = fit.dataset.rows[record] if fit.dataset.rows else 0, tuple(filter(None, reasons))
+        sizes = float(errors[record]), turned, float(times[record])
+        why = unusual or ("nothing is unusual about the pose",)
+        explained.append(Miss(fit.dataset.ids[record], row, *sizes, why, advice))
     limit = float(np.median((errors / np.maximum(times, SMALLEST_SCALE))[known])) if stated is None else stated
-    farthest = tuple(explained(int(i)) for i in missed[:MOST_EXPLAINED])
-    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), farthest)
+    return LargeErrors(limit, stated is not None, int(known.sum()), len(missed), tuple(explained))
 
 
 def _above(numbers: Array) -> Array:
@@ -148,16 +135,15 @@ def _above(numbers: Array) -> Array:
     return np.asarray((ranks + 1) / numbers.shape[-1])
 
 
-def _heaviest(record: int, fit: Fit, efforts: Mapping[str, Array]) -> str:
-    arms = fit.problem.blueprint.arms
-    for name, arm in arms.items():
+def _heavy(record: int, fit: Fit, efforts: Mapping[str, Array]) -> Iterator[str]:
+    """Of each arm the joint that holds more than in most records."""
+    for name, arm in fit.problem.blueprint.arms.items():
         joint = int(np.argmax(efforts[name][:, record]))
-        effort = float(fit.motion.loads[name].efforts[joint, record])
-        if efforts[name][joint, record] > UNUSUAL and abs(effort) > 1e-9:
-            shown = shown_joint(f"{name}.{arm.joint_names[joint]}", arms)
+        effort = abs(float(fit.motion.loads[name].efforts[joint, record]))
+        if efforts[name][joint, record] > UNUSUAL and effort > 1e-9:
             unit = "N m" if arm.joint_dimensions[joint] == "angle" else "N"
-            return f"{shown} holds {abs(effort):.2g} {unit}, among the top 5 %"
-    return ""
+            shown = shown_joint(f"{name}.{arm.joint_names[joint]}", fit.problem.blueprint.arms)
+            yield f"{shown} holds {effort:.2g} {unit}, among the top 5 %"
 
 
 def _along(record: int, fit: Fit, own: Array) -> str:
@@ -171,43 +157,21 @@ def _along(record: int, fit: Fit, own: Array) -> str:
     chance = float(betainc((len(own) - 1) / 2, 0.5, max(0.0, 1 - float(cosine[best]) ** 2)))
     if 1 - (1 - chance) ** int(np.sum(lengths > 0)) > _CHANCE:
         return ""
-    channel = fit.motion.channels[best]
+    channel, along = fit.motion.channels[best], slopes[:, best]
     unit = display_unit(command_channels(arms)[channel]).name
-    off = digits(to_unit(abs(float(own @ slopes[:, best] / (slopes[:, best] @ slopes[:, best]))), unit), 2)
+    off = digits(to_unit(abs(float(own @ along / (along @ along))), unit), 2)
     return f"its error lies along {shown_joint(channel, arms)}'s own motion, as if {off} {unit} off"
 
 
 MOST_LISTED = 10
 MOST_SUSPICIOUS = 0.2  # Of the records; more of them are no outliers
 _FEW_NAMED, MOST_TOLD = 3, 5
-_TOO_MANY = "their noise is larger than the others', or the model lacks something where they are"
 _SHOWN = {"rad": (180 / np.pi, " deg"), "m": (1000.0, " mm")}
 
 
-def suspect_findings(fitted: WeighedFit, ids: Sequence[str]) -> list[Finding]:
-    if not fitted.suspects:
-        return [Finding("good", "No training record lies farther from the fit than noise allows (1 % over all).")]
-    left = "Left in the fit" if fitted.loss == "reject" else f"Weighed less by the loss {fitted.loss}"
-    kept = tuple(suspect for suspect in fitted.suspects if suspect.weight > 0)
-    findings = []
-    for fate, group in (("Set aside", fitted.set_aside), (left, kept)):
-        if not group:
-            continue
-        weights = [f", weight {s.weight:.2g}" if 0 < s.weight < 1 else "" for s in group]
-        listed = [f"{ids[s.record]} ({s.distance:.1f} sd{w})" for s, w in zip(group, weights, strict=True)]
-        text = (
-            f"{fate}, and farther from the fit than noise allows ({group[0].limit:.1f} sd, 1 % over all records): "
-            f"{len(group)} records: {first_few(listed, MOST_LISTED)}. Their errors are counted all the same; "
-            "residuals.csv has them."
-        )
-        findings.append(Finding("warning", text))
-    return findings
-
-
 def component_findings(components: VarianceComponents) -> list[Finding]:
-    joints = components.share("joint")
+    joints, texts = components.share("joint"), []
     parts = sorted(components.components, key=lambda c: -c.share)
-    texts = []
     for c in parts:
         factor, unit = _SHOWN.get(c.unit, (1.0, " times the declared noise"))
         sd = f"{factor * c.sd:.2g}{unit}, 95 % {factor * c.lower:.2g} to {factor * c.upper:.2g}"
@@ -217,14 +181,12 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
         text = f"The noise is not stated but estimated from the residuals, and priors are weighed against it: {listed}."
         action = "State it once you know it: only then do residuals show that the model lacks something."
         return [Finding("note", text, "restricted maximum likelihood", action)]
-    mostly = components.mostly_joints
-    whose, share = ("the joints", joints) if mostly else ("the instruments", 1 - joints)
-    meaning = (
-        " A joint's part is what acts like an angle that is off, repeatable or not: an effect that the model lacks "
-        "looks the same. Poses measured twice would separate the two."
-    )
+    whose, share = ("the joints", joints) if components.mostly_joints else ("the instruments", 1 - joints)
     text = f"Most of the residual variance comes from {whose} ({100 * share:.0f} %): {listed}."
-    findings = [Finding("note", text + (meaning if mostly else ""))]
+    if components.mostly_joints:
+        text += " A joint's part is what acts like an angle that is off, repeatable or not: an effect that the model "
+        text += "lacks looks the same. Poses measured twice would separate the two."
+    findings = [Finding("note", text)]
     if components.inseparable:
         pairs = ", ".join(f"{a} and {b} ({r:+.2f})" for a, b, r in components.inseparable)
         findings.append(Finding("warning", f"These poses hardly separate some variances: {pairs}."))
@@ -234,57 +196,59 @@ def component_findings(components: VarianceComponents) -> list[Finding]:
 
 
 def outlying(fit: Fit) -> list[Finding]:
-    """Records farther from the fit than noise allows, or than ``validation.limit_mm`` where it is stated."""
-    findings = []
-    if fit.fitted.loss != "none":
-        action = "Look at them in residuals.csv, and measure them again."
-        by_loss = suspect_findings(fit.fitted, fit.trained_on)
-        findings = [replace(one, action=action) if one.grade == "warning" else one for one in by_loss]
+    fitted, trained, findings = fit.fitted, fit.ready.trained.ids, list[Finding]()
+    if fitted.loss != "none" and not fitted.suspects:
+        text = "No training record lies farther from the fit than noise allows (1 % over all)."
+        findings.append(Finding("good", text))
+    kept = tuple(suspect for suspect in fitted.suspects if suspect.weight > 0)
+    weighed = "Left in the fit" if fitted.loss == "reject" else f"Weighed less by the loss {fitted.loss}"
+    for fate, group in (("Set aside", fitted.set_aside), (weighed, kept)) if fitted.loss != "none" else ():
+        if group:
+            weights = [f", weight {s.weight:.2g}" if 0 < s.weight < 1 else "" for s in group]
+            listed = [f"{trained[s.record]} ({s.distance:.1f} sd{w})" for s, w in zip(group, weights, strict=True)]
+            text = f"{fate}, and farther from the fit than noise allows ({group[0].limit:.1f} sd, 1 % over all records)"
+            text += f": {len(group)} records: {first_few(listed, MOST_LISTED)}. Their errors are counted all the same; "
+            text, action = f"{text}residuals.csv has them.", "Look at them in residuals.csv, and measure them again."
+            findings.append(Finding("warning", text, action=action))
     beyond, unit = fit.of(large_errors), fit.unit
     if beyond is None:
         return findings
     limit, test = f"{readable(beyond.limit_mm)} {unit}", f"{beyond.judged} records"
+    what = f"an error above {limit}" if beyond.configured else "an error beyond what noise explains"
     if beyond.configured:
-        what, test = f"an error above {limit}", f"{test} by fits that did not see them, limit validation.limit_mm"
+        test += " by fits that did not see them, limit validation.limit_mm"
     else:
-        what = "an error beyond what noise explains"
         test += f", each by its noise and the parameters' uncertainty ({limit} for most), {100 * LEVEL:g} % over all"
     if not beyond.beyond:
         return [*findings, Finding("good", f"No record has {what}.", test)]
     first = beyond.explained[:MOST_TOLD]
     count = "1 record has" if beyond.beyond == 1 else f"{beyond.beyond} records have"
     if not beyond.configured and beyond.beyond > MOST_SUSPICIOUS * beyond.judged:
-        listed = ", ".join(miss.record_id for miss in first)
-        text = f"{count} {what}, the worst {listed}. So many are no outliers: {_TOO_MANY}."
+        text = f"{count} {what}, the worst {', '.join(miss.record_id for miss in first)}. So many are no outliers: "
+        text += "their noise is larger than the others', or the model lacks something where they are."
         action = "Look in residuals.csv at what they have in common, and state their noise if it is known."
         return [*findings, Finding("warning", text, test, action)]
-    listed = "; ".join(f"{miss.record_id} ({_size(miss, beyond, unit)}: {', '.join(miss.reasons)})" for miss in first)
+    listed = []
+    for miss in first:
+        turned = "" if miss.error_deg is None else f" and {readable(miss.error_deg)} deg"
+        times = "" if beyond.configured else f", {miss.times:.1f} times its limit"
+        listed.append(f"{miss.record_id} ({readable(miss.error_mm)} {unit}{turned}{times}: {', '.join(miss.reasons)})")
     more = f"; and {beyond.beyond - MOST_TOLD} more, in the report" if beyond.beyond > MOST_TOLD else ""
-    advice = "; or ".join(dict.fromkeys(miss.advice for miss in first))
-    advice = f"{advice.capitalize()}."
-    if {miss.record_id for miss in first} & set(fit.trained_on):
+    advice = f"{'; or '.join(dict.fromkeys(miss.advice for miss in first)).capitalize()}."
+    if {miss.record_id for miss in first} & set(trained):
         advice += " Or set noise.loss: reject, which sets such records aside."
-    return [*findings, Finding("warning", f"{count} {what}: {listed}{more}.", test, advice)]
-
-
-def _size(miss: Miss, beyond: LargeErrors, unit: str) -> str:
-    turned = "" if miss.error_deg is None else f" and {readable(miss.error_deg)} deg"
-    times = "" if beyond.configured else f", {miss.times:.1f} times its limit"
-    return f"{readable(miss.error_mm)} {unit}{turned}{times}"
+    return [*findings, Finding("warning", f"{count} {what}: {'; '.join(listed)}{more}.", test, advice)]
 
 
 LEAST_SHARE = 0.1  # Of the records: fewer than these are outliers, which the other tests name one by one
 FAR, FAR_IN_NOISE = 7.0, 5.0
 """In standard deviations by the lower quartile of all residuals, and by the declared noise: what is far. Of three equal
 normal coordinates one record in 10^9 is."""
-LEAST_SCALE = 1.5
-"""Residuals in units of the declared noise: a tenth of the records five standard deviations off make more."""
+LEAST_SCALE = 1.5  # Of residuals by the declared noise: a tenth of the records five standard deviations off make more
 _ROUNDS = 60
 _QUARTILE = 0.25
 _SMALLEST = 1e-9
-_RUN = 0.9
-"""So much of a run of records from one place on is far, and so little of those before, where something moved there."""
-
+_RUN = 0.9  # Of the records from one place on are far, and of those before are near, where something moved there
 FEWEST = 8  # Records of a group for it to be judged
 _LEAST_PART = 3
 APART = 5.0
@@ -295,33 +259,29 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class Minority:
-    """Records that contradict the others.
-
-    Attributes:
-        since: the first of them in the recording, if it is all those from there on (or up to there); else None.
-    """
+    """Records that contradict the others."""
 
     far: Indices  # which of the records looked at
     typical_mm: float  # of those that agree, what they are off by (median)
     far_mm: float  # of those that do not, likewise
-    since: int | None
+    since: int | None  # the first of them in the recording, if it is all those from there on; else None
 
 
 def minority(rows: FitRows, noise_scale: float, position: Indices) -> Minority | None:
     """The records that a fit to the majority leaves far off, if they are many; None if there is no such split.
 
     The fit minimises the sum of residual lengths, to first order from the estimate, by weights that are their inverse
-    [Huber1981]: up to half of the records may be off by anything. One whose residuals are as small as their noise
-    (``noise_scale``) has no such records. ``position`` is how many were recorded before each (N).
+    [Huber1981]: up to half of the records may be off by anything. Not where residuals are as small as their noise.
     """
-    acting = np.flatnonzero(_lengths(rows, rows.residual) > 0)
+    residual, data = rows.residual, len(rows.record_of)
+    acting = np.flatnonzero(np.any(residual[rows.by_record] != 0, axis=1))
     if noise_scale < LEAST_SCALE or len(acting) < 1 / LEAST_SHARE:
         return None
-    data, weights = len(rows.record_of), np.ones(len(rows.residual))
+    weights = np.ones(len(residual))
     for _ in range(_ROUNDS):
         step = np.linalg.lstsq(rows.slopes * weights[:, None], -rows.residual * weights, rcond=1e-9)[0]
         residual = rows.residual + rows.slopes @ step
-        lengths = _lengths(rows, residual)
+        lengths = np.linalg.norm(residual[rows.by_record], axis=1)
         floor = max(_SMALLEST, 0.1 * float(np.quantile(lengths, _QUARTILE)))
         weights[:data] = 1 / np.sqrt(np.maximum(lengths, floor))[rows.record_of]
     numbers = min(3, max(1, round(data / len(lengths))))  # more share what the model misses of their record
@@ -330,32 +290,24 @@ def minority(rows: FitRows, noise_scale: float, position: Indices) -> Minority |
     far, near = acting[lengths[acting] > limit], acting[lengths[acting] <= limit]
     if len(far) < LEAST_SHARE * len(acting) or len(far) > len(near):
         return None
-    sizes = rows.errors(residual) * 1000.0
-    return Minority(far, float(np.median(sizes[near])), float(np.median(sizes[far])), _since(far, near, position))
-
-
-def _lengths(rows: FitRows, residual: Array) -> Array:
-    return np.asarray(np.linalg.norm(residual[rows.by_record], axis=1))
-
-
-def _since(far: Indices, near: Indices, position: Indices) -> int | None:
-    order = np.sort(np.concatenate([position[far], position[near]]))
+    order, sizes, since = np.sort(position[acting]), rows.errors(residual) * _MM, None
     is_far = np.isin(order, position[far])
-    if not is_far[-1]:
-        return None
-    after = np.cumsum(is_far[::-1])[::-1]
-    count = np.arange(len(order), 0, -1)
-    best = int(np.argmax(after - (count - after)))
-    inside, outside = float(np.mean(is_far[best:])), float(np.mean(is_far[:best])) if best else 1.0
-    return int(order[best]) if inside >= _RUN and outside <= 1 - _RUN else None
+    after, count = np.cumsum(is_far[::-1])[::-1], np.arange(len(order), 0, -1)
+    best = int(np.argmax(2 * after - count))
+    outside = float(np.mean(is_far[:best])) if best else 1.0
+    if is_far[-1] and float(np.mean(is_far[best:])) >= _RUN and outside <= 1 - _RUN:
+        since = int(order[best])
+    return Minority(far, float(np.median(sizes[near])), float(np.median(sizes[far])), since)
 
 
-def moved_groups(problem: Problem, values: Array) -> list[Finding]:
+def moved(fit: Fit) -> list[Finding]:
     """Groups among weighted records that seem to have moved once, by the clearest split."""
-    findings, plan = [], problem.blueprint
+    if not fit.converged:
+        return []
+    problem, findings = fit.acting, []
     test = f"the best split in recorded order, limit {APART:g} standard deviations"
     action = "Give the records before the move a label of their own, or leave them out."
-    residuals = problem.residuals(values)
+    residuals, plan = problem.residuals(fit.estimate.values), problem.blueprint
     for kernel, record, residual in zip(problem.kernels, problem.records, residuals, strict=True):
         if record.group is None:
             continue
@@ -369,15 +321,9 @@ def moved_groups(problem: Problem, values: Array) -> list[Finding]:
             if distance > APART * scatter:
                 key = group_key(plan.measurements, plan.groups, kernel.factor.name, number)
                 text = f"{key}: its first {before} records lie {digits(distance * _MM)} mm from the other "
-                text += (
-                    f"{own.shape[1] - before}, {distance / scatter:.0f} times their spread. Did it move, or the base?"
-                )
-                findings.append(Finding("warning", text, test, action))
+                text += f"{own.shape[1] - before}, {distance / scatter:.0f} times their spread. Did it move, or the "
+                findings.append(Finding("warning", f"{text}base?", test, action))
     return findings
-
-
-def moved(fit: Fit) -> list[Finding]:
-    return moved_groups(fit.acting, fit.estimate.values) if fit.converged else []
 
 
 def _split(residual: Array) -> tuple[int, float, float]:
@@ -403,15 +349,12 @@ def contradicting(fit: Fit) -> list[Finding]:
     apart = minority(fit.of(sampled_rows)[1], fit.estimate.noise_scale, fit.position[chosen])
     if apart is None:
         return []
-    ids = [fit.dataset.ids[i] for i in chosen]
-    count, total = len(apart.far), len(ids)
-    text = (
-        f"{count} of {total} training records ({100 * count / total:.0f} %) contradict the others: a fit to the "
-        f"majority is off by {digits(apart.typical_mm, 2)} mm there, and by {digits(apart.far_mm)} mm in these"
-    )
-    listed = f"{', '.join(ids[i] for i in apart.far[:_FEW_NAMED])}{', ...' if count > _FEW_NAMED else ''}"
+    ids, count = [fit.dataset.ids[i] for i in chosen], len(apart.far)
+    text = f"{count} of {len(ids)} training records ({100 * count / len(ids):.0f} %) contradict the others: a fit to "
+    text += f"the majority is off by {digits(apart.typical_mm, 2)} mm there, and by {digits(apart.far_mm)} mm in these"
     test = f"sum of residual lengths minimised; far is beyond {FAR:g} sd by the lower quartile"
     if apart.since is None:
+        listed = f"{', '.join(ids[i] for i in apart.far[:_FEW_NAMED])}{', ...' if count > _FEW_NAMED else ''}"
         action = f"Find out what is different about them ({listed}): units, joints, the target, reflections."
         return [Finding("bad", f"{text}.", test, action)]
     text += f": nearly all from record {ids[apart.far[0]]} on"

@@ -12,9 +12,10 @@ is left. Each that was found is then set against all others, against a smooth fu
 what is not among them, and against chance, by the odds: it is named alone only where it is clearly the likeliest.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc
@@ -25,7 +26,6 @@ from armcal.diagnose.causes import (
     WILD,
     Cause,
     Functions,
-    Recorded,
     Records,
     Smooth,
     causes_of,
@@ -36,16 +36,13 @@ from armcal.diagnose.causes import (
 )
 from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import SMALLEST, Fit, FitRows, basis_of, lag_one, own_basis
-from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure, candidates
 from armcal.estimate.uncertainty import automatic_block_length
 from armcal.measure.groups import PairedMeasurement, pose_numbers
-from armcal.problem.problem import Problem
 
-LEVEL = 0.01
+LEVEL = 0.01  # Of everything that is tried together: so often something is said of sound data
 _NEAR, _FAR_LESS = 0.05, 0.9
 """Of rivals of a cause that is significant: beyond this level one is none, and what it leaves is so much less."""
-"""Of everything that is tried together: so often something is said of sound data."""
 CLEAR = 3.0  # Logarithm of the odds, 20 to 1, from which on one explanation is preferred
 FEWEST_RECORDS = 30
 FEWEST_POSES = 40  # Distinct poses below which nothing is said of functions of the pose
@@ -77,13 +74,6 @@ _MM = 1000.0
 
 
 @dataclass(frozen=True)
-class Odds:
-    share: float  # of the odds of all causes, of what is not among them, and of chance, the cause's own
-    alternatives: tuple[str, ...]  # in words, those that it does not beat 20 to 1, the most likely first
-    chance: float  # the share of nothing at all
-
-
-@dataclass(frozen=True)
 class Structure:
     """A cause that was found; kind, subject, words, effect and measure as in ``Cause``."""
 
@@ -109,19 +99,14 @@ class Carrier:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What records predict of the residuals of other poses, by smooth functions of the pose and of time.
-
-    Attributes:
-        pose, time: logarithms of their odds against noise alone.
-        time_imitated, pose_imitated: which share of the one's function the other predicts, or of the records' order.
-    """
+    """What records predict of the residuals of other poses, by smooth functions of the pose and of time."""
 
     by_pose: float  # share of the squared residuals, of records left out
     by_time: float
-    pose: float
+    pose: float  # logarithm of the odds against noise alone
     time: float
-    time_imitated: float
-    pose_imitated: float
+    time_imitated: float  # which share of its function the pose predicts, or of the records' order
+    pose_imitated: float  # which share of its function time predicts
     carriers: tuple[Carrier, ...] = ()  # the most important first
 
     @property
@@ -140,16 +125,12 @@ class Predicted:
 
 @dataclass(frozen=True)
 class Scatter:
-    """What the scatter of residuals depends on.
-
-    Attributes:
-        low, high: scatter in units of the declared noise, in the third of the records with the least and most of it.
-    """
+    """What the scatter of residuals depends on."""
 
     words: str  # as the end of a sentence
     p_value: float  # that it does not, over everything that was tried
-    low: float
-    high: float
+    low: float  # in units of the declared noise, in the third of the records with the least of it
+    high: float  # in that with the most
     alternatives: tuple[str, ...]  # what else may be meant, the most likely first
 
 
@@ -171,19 +152,13 @@ class Repeats:
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """What the residuals of a fit still depend on.
-
-    Attributes:
-        share: of the squared residuals, what is not noise: causes take it up, or other records predict it.
-        predictable: what other records predict beside the causes; None where that is no more than chance does.
-        in_order: whether a function of time could be one of the pose, as poses were visited in an order.
-    """
+    """What the residuals of a fit still depend on."""
 
     structures: tuple[Structure, ...]  # in the order in which they were taken into the model
     more: bool  # whether something was significant still when the search ended
-    share: float
-    predictable: Predicted | None
-    in_order: bool
+    share: float  # of the squared residuals, what is no noise: causes take it up, or other records predict it
+    predictable: Predicted | None  # what others predict beside the causes; None if no more than chance does
+    in_order: bool  # whether a function of time could be one of the pose, as poses were visited in an order
     lag_one: float  # correlation of neighbouring residuals, less what the fit itself makes of it
     lag_p: float  # its p-value, over everything that was tried
     lag_after: float  # the same once the causes are in the model
@@ -205,7 +180,6 @@ class ResidualStructure:
 
     @property
     def shows(self) -> bool:
-        """Whether residuals are more than noise."""
         return bool(self.structures) or self.predictable is not None
 
     @property
@@ -216,57 +190,27 @@ class ResidualStructure:
             return self.predictable is not None and self.predictable.cause == "time"
         return not self.in_order and largest.kind in OVER_TIME
 
-    @property
-    def falls(self) -> float:
-        """By which share the root mean square residual would fall without what is not noise."""
-        return 1 - float(np.sqrt(max(0.0, 1 - self.share)))
-
 
 def structure(fit: Fit) -> ResidualStructure | None:
     """Try the residuals of a fit to records, with the weights they had; None where there are too few to judge."""
     if not fit.converged:
         return None
-    problem, estimate = with_contradicted(fit, fit.few_acting), fit.estimate
-    dataset, position = fit.ready.trained, fit.position[fit.split.train]
-    taking_part = np.any([record.weight[: record.count] > 0 for record in problem.records], axis=0)
-    chosen = _looked_at(np.flatnonzero(taking_part), position)
+    problem, estimate, train = with_contradicted(fit, fit.few_acting), fit.estimate, fit.split.train
+    acting = np.flatnonzero(np.any([record.weight[: record.count] > 0 for record in problem.records], axis=0))
+    chosen = acting[np.argsort(fit.position[train][acting], kind="stable")]
     if len(chosen) < FEWEST_RECORDS:
         return None
-    problem, dataset, position = problem.subset(chosen), dataset.subset(chosen), position[chosen]
+    if len(chosen) > MOST_RECORDS:  # runs of neighbours
+        runs = np.array_split(chosen, 2 * len(chosen) // MOST_RECORDS)
+        chosen = np.concatenate([run[: MOST_RECORDS // len(runs)] for run in runs])
+    problem, dataset, plan = problem.subset(chosen), fit.ready.trained.subset(chosen), problem.blueprint
     rows, read = FitRows.of(problem, estimate), predicted_positions(problem, estimate.values, dataset)
     moves = moves_of(problem, estimate.values, candidates(problem.parameters))
-    here = Records(problem, dataset, fit.motion.subset(fit.split.train[chosen]), read, moves)
+    here = Records(problem, rows, dataset, fit.motion.subset(train[chosen]), read, moves)
     causes = list(causes_of(here))
-    causes, columns = _named_once(problem, causes, [rows.columns(one.columns) for one in causes])
-    contest = Contest(
-        rows,
-        Recorded.of(problem, rows, here.motion, dataset),
-        causes,
-        columns,
-        [(words, f) for words, f in scatter_features(here) if np.ptp(f) > 1e-9 * max(1.0, np.abs(f).max())],
-        pose_numbers(dataset, here.motion.channels),
-        np.diff(position) == 1,
-    )
-    return contest.outcome(_modelled(fit), _is_learnable(problem))
-
-
-def _modelled(fit: Fit) -> frozenset[str]:
-    arms = fit.system.description.get("arms") or {}
-    effects = [effect for arm in arms.values() for effect in (arm.get("effects") or {}).values()]
-    return frozenset(str(effect.get("type")) for effect in effects)
-
-
-def _is_learnable(problem: Problem) -> bool | None:
-    plan = problem.blueprint
-    if any(arm.residual for arm in plan.arms.values()):
-        return None
-    paired = any(isinstance(measurement, PairedMeasurement) for measurement in plan.measurements.values())
-    return not paired and all(kernel.factor.output_channels for kernel in problem.kernels)
-
-
-def _named_once(problem: Problem, causes: Sequence[Cause], columns: Sequence[Array]) -> tuple[list[Cause], list[Array]]:
-    """Without what a held parameter of a joint's effect does as well, a spring's or a gear's: that one is named."""
-    effects = {f"{name}.{effect}" for name, arm in problem.blueprint.arms.items() for effect in arm.effects}
+    columns = [rows.columns(one.columns) for one in causes]
+    # What a held parameter of a joint's effect does as well, a spring's or a gear's, is named as that parameter.
+    effects = {f"{name}.{effect}" for name, arm in plan.arms.items() for effect in arm.effects}
     unit = [column / max(float(np.linalg.norm(column)), 1e-300) for column in columns]
     held = [u for c, u in zip(causes, unit, strict=True) if c.subject.rpartition(".")[0] in effects and u.shape[1] == 1]
     kept = [
@@ -274,16 +218,21 @@ def _named_once(problem: Problem, causes: Sequence[Cause], columns: Sequence[Arr
         for i, own in enumerate(unit)
         if causes[i].kind == "held" or own.shape[1] > 1 or all(abs(float(np.sum(one * own))) < _SAME for one in held)
     ]
-    return [causes[i] for i in kept], [columns[i] for i in kept]
-
-
-def _looked_at(candidates: Indices, position: Indices) -> Indices:
-    order = candidates[np.argsort(position[candidates], kind="stable")]
-    if len(order) <= MOST_RECORDS:
-        return order
-    runs = np.array_split(order, 2 * len(order) // MOST_RECORDS)
-    most = MOST_RECORDS // len(runs)
-    return np.concatenate([run[:most] for run in runs])
+    contest = Contest(
+        here,
+        [causes[i] for i in kept],
+        [columns[i] for i in kept],
+        [(words, f) for words, f in scatter_features(here) if np.ptp(f) > 1e-9 * max(1.0, np.abs(f).max())],
+        pose_numbers(dataset, here.motion.channels),
+        np.diff(fit.position[train][chosen]) == 1,
+    )
+    described = (fit.system.description.get("arms") or {}).values()
+    modelled = {str(effect.get("type")) for arm in described for effect in (arm.get("effects") or {}).values()}
+    learnable = None
+    if not any(arm.residual for arm in plan.arms.values()):
+        paired = any(isinstance(measurement, PairedMeasurement) for measurement in plan.measurements.values())
+        learnable = not paired and all(kernel.factor.output_channels for kernel in problem.kernels)
+    return contest.outcome(modelled, learnable)
 
 
 @dataclass(frozen=True)
@@ -298,23 +247,21 @@ class Tried:
     smooth_p: float  # the smaller one of the functions of pose and of time
     scatter_p: Array  # of each thing on which the scatter may depend
 
-    @property
-    def least(self) -> float:
-        p_values = np.concatenate([self.p_values, self.scatter_p, [self.lag_p, self.smooth_p]])
-        return float(p_values.min())
-
 
 @dataclass(frozen=True)
 class Contest:
     """Everything that may explain the residuals of a fit."""
 
-    rows: FitRows
-    recorded: Recorded
+    recorded: Records
     causes: Sequence[Cause]
     columns: Sequence[Array]  # of each (rows x k)
     scatters: Sequence[tuple[str, Array]]  # on which the scatter may depend (N each)
     pose: Indices  # of each record the number of its pose (N)
     neighbours: Mask  # whether each record but the last is followed by its neighbour in the recording (N - 1)
+
+    @property
+    def rows(self) -> FitRows:
+        return self.recorded.rows
 
     @cached_property
     def basis(self) -> Array:
@@ -328,10 +275,8 @@ class Contest:
 
     @cached_property
     def block(self) -> Indices:
-        """The block of each row: as long as errors resemble their neighbours', and neither too many nor too few.
-
-        The rows of priors and drifts are dealt out to them in turn.
-        """
+        """The block of each row, as long as errors resemble their neighbours': neither too many nor too few. Rows of
+        priors and drifts are dealt out to them in turn."""
         count, data = len(self.rows.by_record), len(self.rows.record_of)
         length = automatic_block_length(self.rows.residual[self.rows.by_record].T)
         length = max(min(length, max(1, count // _FEWEST_BLOCKS)), -(-count // _MOST_BLOCKS))
@@ -357,7 +302,7 @@ class Contest:
             names.append(CHANGING if cause.kind == "order" and not cause.subject else once)
         return tuple(names)
 
-    def outcome(self, modelled: frozenset[str], learnable: bool | None) -> ResidualStructure:
+    def outcome(self, modelled: Collection[str], learnable: bool | None) -> ResidualStructure:
         chosen, first, last = self._search()
         worth = (1 - max(last.lag, 0.0)) / (1 + max(last.lag, 0.0))
         settled = self._settled(chosen, worth)
@@ -388,7 +333,7 @@ class Contest:
             learnable=learnable,
             noise=self._scatter(last, residual, basis),
             repeats=self._repeats(),
-            mean_mm=self.rows.mean_error(self.residual) * _MM,
+            mean_mm=float(np.mean(self.rows.errors(self.residual))) * _MM,
             tested=len(first.p_values) + len(first.scatter_p) + 3,
             records=len(self.pose),
             poses=len(self.groups),
@@ -427,8 +372,9 @@ class Contest:
     def _tried_well(self, others: Sequence[int]) -> Tried:
         """By few draws, and by all where these leave the level of anything, or of a cause, in doubt."""
         tried = self._tried(others, FEWER_DRAWS)
-        doubtful = (tried.least, tried.p_values.min(initial=1.0))
-        if any(1 / (1 + FEWER_DRAWS) < p <= _OUT_OF_QUESTION for p in doubtful):
+        of_causes = tried.p_values.min(initial=1.0)
+        least = min(of_causes, tried.scatter_p.min(initial=1.0), tried.lag_p, tried.smooth_p)
+        if any(1 / (1 + FEWER_DRAWS) < p <= _OUT_OF_QUESTION for p in (least, of_causes)):
             return self._tried(others, DRAWS)
         return tried
 
@@ -439,8 +385,13 @@ class Contest:
         own = [(i, of) for i in remaining if (of := own_basis(self.columns[i], basis)[0]).shape[1]]
         lag, lag_p = lag_one(both, self.rows.by_record, self.neighbours & (np.diff(self.pose) != 0))
         functions = (self.recorded.of_pose, self.recorded.of_time) if len(self.groups) >= FEWEST_POSES else ()
-        smooth_p = [_p_of_gains(Smooth.of(f, basis).gains(both)) for f in functions]
-        smooth_p.append(np.ones(1 + draws))
+        smooth_p = [np.ones(1 + draws)]
+        for gains in (Smooth.of(own, basis).gains(both) for own in functions):
+            # By the tail of those of chance (all but the first), which is exponential.
+            middle = float(np.median(gains[1:]))
+            tail = float(np.mean(gains[1:][gains[1:] >= middle])) - middle
+            p = 0.5 * np.exp(-np.maximum(gains - middle, 0.0) / max(tail, 1e-12))
+            smooth_p.append(np.maximum(p, SMALLEST))
         p_values = self._score_tests([of for _, of in own], both)
         of_scatter = self._of_scatter(residual, basis, draws)
         least = np.min([p_values.min(axis=0, initial=1.0), lag_p, *smooth_p, of_scatter.min(axis=0, initial=1.0)], 0)
@@ -471,8 +422,8 @@ class Contest:
     def _score_tests(self, bases: Sequence[Array], both: Array) -> Array:
         """P-values of sums of block products by their own spread (bases x m); 1 where blocks are too few.
 
-        T = s' (sum of s_b s_b')^-1 s lies between 0 and the number of blocks B, and (B - k)/k T/(B - T) follows
-        F(k, B - k) for independent normal blocks.
+        T = s' (sum of s_b s_b')^-1 s is at most the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k) for
+        independent normal blocks.
         """
         p_values, by_size = np.ones((len(bases), both.shape[1])), dict[int, list[int]]()
         for i, basis in enumerate(bases):
@@ -542,10 +493,8 @@ class Contest:
         return Smooth.of([functions], basis).predicted(residual, self.groups)[1]
 
     def _carriers(self, residual: Array, basis: Array, whole: Predicted) -> Iterator[Carrier]:
-        """What predicts it, one after another, each that which predicts most beside the ones before it.
-
-        Time is one of them only where it predicts more than all others: of poses in an order it predicts much.
-        """
+        """What predicts it, one after another, each that which predicts most beside the ones before it. Time is one of
+        them only where it predicts more than all others: of poses in an order it predicts much."""
         inputs, taken, so_far = self.recorded.inputs, list[int](), 0.0
         possible = {i for i, own in enumerate(inputs) if own.kind != "time" or whole.by_time > whole.by_pose}
         while possible and len(taken) < _MOST_CARRIERS:
@@ -558,7 +507,6 @@ class Contest:
             taken, so_far = [*taken, best], reached[best]
 
     def _repeats(self) -> Repeats | None:
-        """What records of one pose say of noise; None where hardly a pose was repeated."""
         by_record, size = self.rows.by_record, np.bincount(self.pose)
         again = int(np.sum(size - 1))
         if again < _FEWEST_REPEATS:
@@ -579,34 +527,38 @@ class Contest:
             float(fdtrc(lacking, spare, ratio)) if lacking > 0 else 1.0,
         )
 
-    def _settled(self, chosen: Mapping[int, float], worth: float) -> dict[int, tuple[float, Odds]]:
-        """Causes with p-values and odds, each beside the others: the likeliest in its place.
+    def _settled(self, chosen: Mapping[int, float], worth: float) -> dict[int, tuple[float, float, tuple[str, ...]]]:
+        """Causes with p-value, share of the odds and alternatives, each beside the others: the likeliest in its place.
 
         None that chance beats, and none with less than 1 % of the odds: what then is left is none of the causes.
-
         ``worth`` is how much of a record each record is, where neighbours err alike. The best of many causes is
         significant in some recordings of nothing but noise; odds say which of them are chance.
         """
-        settled = list(chosen)
-        for _ in range(len(settled)):
-            before = list(settled)
-            for place in range(len(settled)):
-                others = settled[:place] + settled[place + 1 :]
-                settled[place] = int(np.argmax(self._gains(*self.beside(others), others, worth)))
-            if settled == before:
-                break
-        odds = [self._odds(cause, [o for o in settled if o != cause], worth) for cause in settled]
-        whole = {i: (p, odd) for i, p, odd in zip(settled, chosen.values(), odds, strict=True)}
-        least = max(whole, key=lambda i: whole[i][1].chance, default=None)
-        if least is not None and whole[least][1].chance <= _LIKELIER:
-            least = min(whole, key=lambda i: whole[i][1].share)
-            least = least if whole[least][1].share < _HOPELESS else None
-        if least is None:
-            return whole
-        return self._settled({i: p for i, (p, _) in whole.items() if i != least}, worth)
+        settled, p_values = list(chosen), list(chosen.values())
+        while True:
+            for _ in range(len(settled)):
+                before = list(settled)
+                for place in range(len(settled)):
+                    others = settled[:place] + settled[place + 1 :]
+                    settled[place] = int(np.argmax(self._gains(*self.beside(others), others, worth)))
+                if settled == before:
+                    break
+            odds = [self._odds(cause, [o for o in settled if o != cause], worth) for cause in settled]
+            of_chance, shares = [own[2] for own in odds], [own[0] for own in odds]
+            if settled and max(of_chance) > _LIKELIER:
+                least = int(np.argmax(of_chance))
+            elif settled and min(shares) < _HOPELESS:
+                least = int(np.argmin(shares))
+            else:
+                named = zip(settled, p_values, odds, strict=True)
+                return {i: (p, share, alternatives) for i, p, (share, alternatives, _) in named}
+            del settled[least], p_values[least]
 
-    def _odds(self, cause: int, others: Sequence[int], worth: float) -> Odds:
-        """Of a cause beside others in the model."""
+    def _odds(self, cause: int, others: Sequence[int], worth: float) -> tuple[float, tuple[str, ...], float]:
+        """A cause's share of the odds, beside others in the model; what it does not beat 20 to 1; chance's share.
+
+        Of all causes, of what is not among them, and of chance.
+        """
         residual, basis = self.beside(others)
         gains = self._gains(residual, basis, others, worth)
         shown = dict.fromkeys(self.names, -np.inf)
@@ -630,7 +582,7 @@ class Contest:
         close = [name for name, gain in shown.items() if gain > shown[mine] - CLEAR and name != mine]
         of_name = dict(zip(reversed(self.names), [c.words for c in reversed(self.causes)], strict=True))
         alternatives = tuple(of_name.get(name, name) for name in sorted(close, key=lambda name: -shown[name]))
-        return Odds(float(np.exp(shown[mine] - total)), alternatives, float(np.exp(shown[CHANCE] - total)))
+        return float(np.exp(shown[mine] - total)), alternatives, float(np.exp(shown[CHANCE] - total))
 
     def _gains(self, residual: Array, basis: Array, others: Sequence[int], worth: float) -> Array:
         total, freedom = max(float(residual @ residual), SMALLEST), len(residual) - basis.shape[1]
@@ -643,9 +595,7 @@ class Contest:
                 gains[i] -= 0.5 * own.shape[1] * np.log(max(freedom * worth, 2.0))
         return gains
 
-    def _structure(
-        self, cause: int, others: Sequence[int], modelled: frozenset[str], p_value: float, odds: Odds
-    ) -> Structure:
+    def _structure(self, cause: int, others: Sequence[int], modelled: Collection[str], *odds: Any) -> Structure:
         one, (residual, basis) = self.causes[cause], self.beside(others)
         own, coefficients = own_basis(self.columns[cause], basis)
         effect = one.effect
@@ -658,17 +608,10 @@ class Contest:
             gram = own[~judged].T @ own[~judged]
             ridge = 1e-9 * max(float(np.trace(gram)), SMALLEST) * np.eye(len(gram))
             left[judged] -= own[judged] @ np.linalg.solve(gram + ridge, own[~judged].T @ residual[~judged])
-        falls = self.rows.mean_error(residual) - self.rows.mean_error(left)
+        falls = float(np.mean(self.rows.errors(residual)) - np.mean(self.rows.errors(left)))
         size = _size(one, -coefficients @ (own.T @ residual))
-        named = (one.kind, one.subject, one.words, effect, one.measure)
-        return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, odds.share, odds.alternatives)
-
-
-def _p_of_gains(gains: Array) -> Array:
-    """By the tail of those of chance (all but the first), which is exponential."""
-    middle = float(np.median(gains[1:]))
-    tail = float(np.mean(gains[1:][gains[1:] >= middle])) - middle
-    return np.asarray(np.maximum(0.5 * np.exp(-np.maximum(gains - middle, 0.0) / max(tail, 1e-12)), SMALLEST))
+        named, (p_value, *whose) = (one.kind, one.subject, one.words, effect, one.measure), odds
+        return Structure(*named, p_value, share, max(0.0, falls) * _MM, size, *whose)
 
 
 def _by_spread(products: Array) -> Array:
@@ -711,10 +654,9 @@ _NO_NOISE = 0.01
 
 
 def depends(fit: Fit) -> list[Finding]:
-    return structure_findings(fit.of(structure), fit.unit) if fit.converged else []
-
-
-def structure_findings(outcome: ResidualStructure | None, unit: str = "mm") -> list[Finding]:
+    if not fit.converged:
+        return []
+    outcome, unit = fit.of(structure), fit.unit
     if outcome is None:
         text = "The training records are too few to tell whether the model lacks anything."
         return [Finding("note", text, f"at least {FEWEST_RECORDS} records", "Measure more poses.")]
@@ -736,25 +678,33 @@ def structure_findings(outcome: ResidualStructure | None, unit: str = "mm") -> l
     if outcome.poses < FEWEST_POSES:
         text = "There are too few distinct poses to test whether the pose still predicts the residuals."
         findings.append(Finding("note", text, f"at least {FEWEST_POSES} distinct poses", "Measure more poses."))
-    return [*findings, *_scatter_findings(outcome, test)]
+    scatter = outcome.noise
+    if scatter is not None and scatter.high >= _NO_NOISE:
+        on = "; or on ".join([scatter.words, *scatter.alternatives[:_MOST_TOLD]])
+        text = f"The spread of the residuals depends on {on}: from {digits(scatter.low, 2)} to "
+        text += f"{digits(scatter.high, 2)} times the declared noise, in the thirds of the records with the least and "
+        text += "the most of it. Either the noise varies, or the model errs more there."
+        test = f"regression of squared residuals, p {_p(scatter.p_value)}; {test}"
+        action = "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise"
+        findings.append(Finding("warning", text, test, f"{action} by record."))
+    return findings
 
 
 def _cause_finding(s: Structure, outcome: ResidualStructure, unit: str, test: str) -> Finding:
     """One cause if it is clearly the likeliest, else all that it does not beat."""
-    falls = (
-        f"the mean training residual of {readable(outcome.mean_mm)} {unit} would fall by {readable(s.falls_mm)} {unit}"
-    )
-    what = s.words + (f" ({s.size})" if s.size else "")
+    falls = f"the mean training residual of {readable(outcome.mean_mm)} {unit} would fall by {readable(s.falls_mm)} "
+    falls, what = falls + unit, s.words + (f" ({s.size})" if s.size else "")
     test = f"p {_p(s.p_value)}, {test}; odds among all of them and what is none of them"
+    odds = "over 99 %" if s.odds > 0.99 else "less than 1 %" if s.odds < 0.01 else f"{100 * s.odds:.0f} %"
     if not s.alternatives:
         model = f"Model it: {s.effect}. " if s.effect else "No effect of armcal models this. "
-        text = f"Residuals still depend on {what}: modelled, {falls}. It has {_share(s.odds)} of the odds."
+        text = f"Residuals still depend on {what}: modelled, {falls}. It has {odds} of the odds."
         return Finding("warning", text, test, f"{model}To be sure: {s.measure}.")
     named = [what, *s.alternatives] if s.odds >= _LIKELY else [s.alternatives[0], what, *s.alternatives[1:]]
     more = len(named) - _MOST_TOLD
     text = f"Residuals still depend on {'; or on '.join(named[:_MOST_TOLD])}"
     text += f"; or on {more} more (metrics.json). " if more > 0 else ". "
-    text += f"These data do not identify which. Modelled as {s.words}, which has {_share(s.odds)} of the odds, {falls}."
+    text += f"These data do not identify which. Modelled as {s.words}, which has {odds} of the odds, {falls}."
     model = f" Then model it: {s.effect}." if s.effect and s.kind not in ("order", "step") else ""
     return Finding("warning", text, test, f"To find out: {s.measure}.{model}")
 
@@ -763,27 +713,21 @@ def _rest_finding(rest: Predicted, outcome: ResidualStructure, test: str) -> Fin
     """What neither noise nor a cause explains: whether the pose predicts it, or time, or either."""
     test = f"smooth functions of {outcome.poses} poses, each predicted by the others; {test}"
     test += f"; log odds against noise: pose {rest.pose:.0f}, time {rest.time:.0f}"
-    text = f"{predicted_in_short(outcome)} {_WHY[rest.cause]} the pose predicts {percent(rest.by_pose)} of "
-    text += f"them, time {percent(rest.by_time)}."
+    if rest.share <= 0:
+        text = f"Residuals of neighbouring records correlate by {outcome.lag_after:.2f}: they are not noise."
+    else:
+        names = [carrier.words for carrier in rest.carriers]
+        listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+        text = f"{percent(outcome.share)} of the variance of the residuals is not noise: other records predict it, "
+        if outcome.worthwhile:
+            text = f"Beside what is named, other records predict {percent(rest.share)} of the residuals, "
+        text += f"mostly from {listed}."
+    text += f" {_WHY[rest.cause]} the pose predicts {percent(rest.by_pose)} of them, time {percent(rest.by_time)}."
     if outcome.in_order:
         text += " The poses were visited in an order."
     action = "Model what is named above, then look again. " if outcome.worthwhile else ""
-    slight = outcome.falls < WORTHWHILE
+    slight = 1 - float(np.sqrt(max(0.0, 1 - outcome.share))) < WORTHWHILE  # of the root mean square
     return Finding("note" if slight else "warning", text, test, action + " ".join(_remedies(rest, outcome.learnable)))
-
-
-def predicted_in_short(outcome: ResidualStructure) -> str:
-    rest = outcome.predictable
-    if rest is None or rest.share <= 0:
-        return f"Residuals of neighbouring records correlate by {outcome.lag_after:.2f}: they are not noise."
-    names = [carrier.words for carrier in rest.carriers]
-    listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-    if outcome.worthwhile:
-        return (
-            f"Beside what is named, other records predict {percent(rest.share)} of the residuals, mostly from {listed}."
-        )
-    text = f"{percent(outcome.share)} of the variance of the residuals is not noise"
-    return f"{text}: other records predict it, mostly from {listed}."
 
 
 def _remedies(rest: Predicted, learnable: bool | None) -> Iterator[str]:
@@ -819,39 +763,13 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.095 else f"{100 * share:.1g} %" if share > 0.0005 else "0.1 %"
 
 
-def _share(odds: float) -> str:
-    return "over 99 %" if odds > 0.99 else "less than 1 %" if odds < 0.01 else f"{100 * odds:.0f} %"
-
-
 def _p(p: float) -> str:
     return f"{p:.3f}" if p >= 0.01 else f"below {0.005 if p < 0.005 else 0.01:g}"
 
 
-def _scatter_findings(outcome: ResidualStructure, test: str) -> list[Finding]:
-    scatter = outcome.noise
-    if scatter is None or scatter.high < _NO_NOISE:
-        return []
-    on = "; or on ".join([scatter.words, *scatter.alternatives[:_MOST_TOLD]])
-    text = f"The spread of the residuals depends on {on}:"
-    text += (
-        f" from {digits(scatter.low, 2)} to {digits(scatter.high, 2)} times the declared noise, in the thirds of the"
-    )
-    text += " records with the least and the most of it. Either the noise varies, or the model errs more there."
-    test = f"regression of squared residuals, p {_p(scatter.p_value)}; {test}"
-    action = (
-        "Repeat a pose at both ends of it: if repeats spread equally, the model is the cause; else state noise by "
-        "record."
-    )
-    return [Finding("warning", text, test, action)]
-
-
 def repeated(fit: Fit) -> list[Finding]:
-    return [] if (outcome := fit.of(structure)) is None else repeat_findings(outcome, fit.unit)
-
-
-def repeat_findings(outcome: ResidualStructure, unit: str) -> list[Finding]:
-    repeats = outcome.repeats
-    if repeats is None or not repeats.exceeded:
+    outcome, unit = fit.of(structure), fit.unit
+    if outcome is None or (repeats := outcome.repeats) is None or not repeats.exceeded:
         return []
     text = (
         f"Repeats of a pose scatter by {readable(repeats.scatter_mm)} {unit}, residuals are "
@@ -869,11 +787,7 @@ def repeat_findings(outcome: ResidualStructure, unit: str) -> list[Finding]:
 
 
 def neighbours(fit: Fit) -> list[Finding]:
-    return neighbour_findings(fit.of(structure), fit.estimate)
-
-
-def neighbour_findings(outcome: ResidualStructure | None, estimate: Estimate) -> list[Finding]:
-    """What it costs that neighbours err alike; why they do, the structure says."""
+    outcome, estimate = fit.of(structure), fit.estimate
     if outcome is None:
         return []
     test = f"lag-one correlation, {100 * outcome.level:g} % over everything that was tested"
@@ -883,15 +797,10 @@ def neighbour_findings(outcome: ResidualStructure | None, estimate: Estimate) ->
     if outcome.lag_after_p > outcome.level:
         return [Finding("note", f"{text}; what was found above explains it.", test)]
     text += f", by {outcome.lag_after:.2f} still beside what was found. " if outcome.structures else ". "
-    return [Finding("note", text + _what_neighbours_cost(estimate), test)]
-
-
-def _what_neighbours_cost(estimate: Estimate) -> str:
-    factors = estimate.widened
-    if not factors:
-        return "In the order in which these poses were measured that does not widen the intervals of the parameters."
-    widest = int(np.argmax(factors))
-    return (
-        "Intervals that assume independent errors would be too narrow; those of the parameters are wider, by a factor "
-        f"of {float(np.median(factors)):.1f} (median), at most {max(factors):.1f} ({estimate.names[widest]})."
-    )
+    if factors := estimate.widened:
+        text += "Intervals that assume independent errors would be too narrow; those of the parameters are wider, by a "
+        text += f"factor of {float(np.median(factors)):.1f} (median), at most {max(factors):.1f} "
+        text += f"({estimate.names[int(np.argmax(factors))]})."
+    else:
+        text += "In the order in which these poses were measured that does not widen the intervals of the parameters."
+    return [Finding("note", text, test)]
