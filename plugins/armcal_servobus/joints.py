@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from typing import Annotated, Literal, NamedTuple
 
@@ -19,9 +18,7 @@ from armcal_servobus.models import COUNTS, MODELS, STEP, ServoModel
 
 SEVERAL_TURNS = 0x10  # Of a Feetech servo's phase: it reports angles of several turns
 _SLACK = 1e-9
-_READ_TWICE = 2
 _ROUNDED = 2  # Counts: limits in a servo may be so much narrower than a range that was rounded
-_FASTEST = 32767  # As the registers have it, in which zero is no limit
 
 
 class BusJointSettings(Settings):
@@ -88,7 +85,6 @@ class ServoJointsSettings(BusSettings):
         return chosen
 
 
-@dataclass(frozen=True)
 class ServoJoint:
     """A joint and its servo.
 
@@ -96,20 +92,10 @@ class ServoJoint:
     means the angle that is nearest to the middle of the joint's range.
     """
 
-    name: str
-    settings: BusJointSettings
-
-    @property
-    def id(self) -> int:
-        return self.settings.id
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} (id {self.id})"
-
-    @property
-    def model(self) -> ServoModel:
-        return MODELS[self.settings.model]
+    def __init__(self, name: str, settings: BusJointSettings) -> None:
+        self.name, self.settings = name, settings
+        self.id, self.model = settings.id, MODELS[settings.model]
+        self.label = f"{name} (id {self.id})"
 
     @cached_property
     def count_range(self) -> tuple[int, int]:
@@ -128,11 +114,9 @@ class ServoJoint:
         return low < 0 or high >= COUNTS
 
     def angle(self, count: float) -> float:
-        """Of a count (rad), as it stands."""
         return self.settings.direction * STEP * (count - self.settings.zero_count)
 
     def exact_count(self, angle: float) -> float:
-        """Of an angle (rad), not rounded; ``angle`` turned round."""
         return self.settings.zero_count + self.settings.direction * angle / STEP
 
     def unwrapped(self, count: int) -> int:
@@ -165,7 +149,7 @@ def check_offset(model: ServoModel, offset: int) -> None:
     )
 
 
-def drivable(joints: Collection[ServoJoint]) -> None:
+def drivable(joints: Iterable[ServoJoint]) -> None:
     """Raise ValueError if a joint's range crosses the end of its encoder's turn, over which no servo can be driven."""
     for joint in joints:
         if joint.crosses_seam:
@@ -178,39 +162,24 @@ def drivable(joints: Collection[ServoJoint]) -> None:
 
 
 class Mistake(NamedTuple):
-    """Something about a servo that is not as configured, and what to do. ``of_motion``: only one that moves minds."""
+    """Something about a servo that is not as configured."""
 
     joint: str
     what: str
-    mend: str
-    of_motion: bool = False
+    mend: str  # what to do
+    of_motion: bool = False  # it matters only if joints are to move
 
 
 class Servos:
-    """The servos of joints on their bus; each call is an exchange or two for all of them.
-
-    Attributes:
-        joints: by name.
-        stored: what servos keep without power, by joint and register; of those that were as configured in ``examine``.
-    """
+    """The servos of joints on their bus, by the joints' names."""
 
     def __init__(self, settings: ServoJointsSettings, names: Iterable[str]) -> None:
         self.joints = settings.chosen(names)
         self.bus = Bus(settings, {joint.id: name for name, joint in self.joints.items()})
-        self.stored: dict[str, dict[str, int]] = {}
-        self._goals: dict[str, int] = {}
-        self._speeds: dict[str, int] = {}
+        self.stored: dict[str, dict[str, int]] = {}  # what those that ``examine`` recognised keep without power
 
     def open(self, *, moves: bool = True) -> str:
-        """Open the bus; gives the adapter's serial number where all is as configured.
-
-        Args:
-            moves: whether joints are to move.
-
-        Raises:
-            DeviceLostError: no servo answers at all.
-            DeviceRefusedError: something is not as configured; every fault is named.
-        """
+        """Open the bus; gives the adapter's serial number where all is as configured, else names every fault."""
         try:
             adapter = self.bus.open()
             mistakes = [mistake for mistake in self.examine() if moves or not mistake.of_motion]
@@ -226,7 +195,7 @@ class Servos:
     def examine(self) -> list[Mistake]:
         """Read what the servos store; gives all that is not as configured."""
         bus, joints = self.bus, self.joints
-        servos = {name: looked_at(bus, joint.id, _READ_TWICE) for name, joint in joints.items()}
+        servos = {name: looked_at(bus, joint.id, times=2) for name, joint in joints.items()}
         ids = {joint.id for joint in joints.values()}
         strangers = [servo for servo in present(bus) if servo not in ids] if None in servos.values() else []
         if not strangers and not any(servos.values()):
@@ -252,63 +221,22 @@ class Servos:
         return mistakes
 
     def readings(self) -> dict[str, dict[str, int]]:
-        """What changes while servos work, by joint and register, as it stands there."""
+        """What changes while servos work, by joint and register."""
         by_id = self.bus.numbers([joint.id for joint in self.joints.values()], *self.bus.map.polled)
         return dict(zip(self.joints, by_id.values(), strict=True))
 
     def angle(self, name: str, reading: Mapping[str, int]) -> float:
-        """Where a joint stands (rad) by a reading."""
+        """Where a joint stands (rad)."""
         joint = self.joints[name]
         return joint.angle(joint.unwrapped(reading["position"]))
 
-    def set_motion(self, name: str, speed: float, acceleration: float) -> None:
-        """How fast a servo turns by itself at most (rad/s, rad/s^2). Zero would be no limit, so it is never written."""
-        for key, value in (("acceleration", acceleration), ("speed", speed)):
-            register = self.bus.map.registers[key]
-            most = 254 if register.size == 1 else _FASTEST
-            number = min(max(round(value / register.unit), 1), most)
-            self.bus.set_number(self.joints[name].id, key, number)
-        self._speeds[name] = number
-
-    def hold(self, name: str, count: int) -> None:
-        """Torque on, at a count that is where it stands."""
-        servo = self.joints[name].id
-        self.bus.set_number(servo, "goal", count)
-        self.bus.set_number(servo, "torque", 1)
-        self.bus.set_number(servo, "goal", count)  # some servos set their goal anew when torque comes on
-        self._goals[name] = count
-
     def release(self, name: str) -> None:
         """Torque off, read back."""
-        self._goals.pop(name, None)
         joint = self.joints[name]
         self.bus.set_number(joint.id, "torque", 0)
         if self.bus.number(joint.id, "torque"):
             text = f"the torque of {joint.label} did not go off."
             raise DeviceError(text, where=self.bus.where, hint="Hold the arm and switch the servos' power off.")
-
-    def command(self, goals: Mapping[str, int]) -> None:
-        """Goals of joints whose motion was set, all at once."""
-        self._goals |= goals
-        written = {self.joints[name].id: self._goal_bytes(name) for name in goals}
-        self.bus.write_all(self.bus.map.registers["goal"].address, written)
-
-    def repeat(self, readings: Mapping[str, Mapping[str, int]], powered: Collection[str]) -> None:
-        """Command once more what did not arrive: a goal for all at once is acknowledged by nobody."""
-        for name, goal in self._goals.items():
-            if name in powered and readings[name]["goal"] != goal:
-                address = self.bus.map.registers["goal"].address
-                self.bus.write(self.joints[name].id, address, self._goal_bytes(name))
-
-    def _goal_bytes(self, name: str) -> bytes:
-        """A goal, and the speed in the same go where its register follows.
-
-        A servo that started anew has forgotten its speed, and some switch their torque on with the next goal. Zero
-        between the two is a time to be taken of some servos: the speed holds.
-        """
-        goal, speed = (self.bus.map.registers[register] for register in ("goal", "speed"))
-        data, between = goal.pack(self._goals[name]), speed.address - goal.address - goal.size
-        return data + bytes(between) + speed.pack(self._speeds[name]) if between >= 0 else data
 
 
 def _mistakes(joint: ServoJoint, stored: Mapping[str, int]) -> list[Mistake]:

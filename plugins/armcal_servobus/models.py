@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 ProtocolName = Literal["feetech", "dynamixel2"]
 COUNTS = 4096  # Of a turn; the encoder goes on from the last one to zero
@@ -24,7 +24,6 @@ class Register:
     unit: float = 1.0  # what one count is, in SI
 
     def pack(self, value: int) -> bytes:
-        """As it is written."""
         bits = self.sign_bit if self.sign_bit is not None else 8 * self.size - self.is_signed
         most = (1 << bits) - 1
         least = -most if self.sign_bit is not None else -(most + 1) if self.is_signed else 0
@@ -42,8 +41,7 @@ class Register:
         return -magnitude if value >> self.sign_bit & 1 else magnitude
 
 
-Stretch = tuple[int, int]
-"""Registers that follow each other: the address of the first one, and how many bytes."""
+Stretch = tuple[int, int]  # Registers that follow each other: the address of the first one, and how many bytes
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,7 @@ class RegisterMap:
         return (*named, f"alarm 0x{unknown:02x}") if unknown else named
 
 
-@dataclass(frozen=True)
-class ServoModel:
-    """A kind of servo."""
-
+class ServoModel(NamedTuple):
     name: str  # as configurations have it
     protocol: ProtocolName  # that it speaks
     number: int | None  # as its register has it; None: of all that are alike
@@ -135,15 +130,10 @@ _ALL = (
     *(ServoModel(name, "dynamixel2", number, knows_load=False) for name, number in _BY_CURRENT.items()),
 )
 MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _ALL})
+# Those that servos can be set to, the likeliest first
 BAUD_RATES: Mapping[ProtocolName, tuple[int, ...]] = MappingProxyType(
     {
         "feetech": (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400),
         "dynamixel2": (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600),
     }
 )
-"""Those that servos can be set to, the likeliest first."""
-
-
-def model_of(protocol: ProtocolName, number: int) -> str | None:
-    """The name of the model with a number; None: not known."""
-    return next((model.name for model in _ALL if model.protocol == protocol and model.number == number), None)
