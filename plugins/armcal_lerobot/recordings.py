@@ -13,7 +13,7 @@ from armcal.base.arrays import Array
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import write_over
 from armcal.measure.csv_writer import csv_text
-from armcal.measure.rests import StillSettings, rests
+from armcal.measure.rests import StillSettings, last_motions, rests
 from armcal.plugins import library
 
 from armcal_lerobot.motor_files import MotorFile, Units, is_gripper, read_json, require_motors, wiring_of
@@ -182,19 +182,6 @@ def is_copy(recording: Recording) -> bool:
     )
 
 
-def _sides(command: Array) -> Array:
-    """Which way a command (N, deg) moved last: -1, 1, or 0 before its first motion."""
-    sides = np.zeros(len(command))
-    side, extreme = 0.0, float(command[0])
-    for i, value in enumerate(command.tolist()):
-        if (value - extreme) * side > 0:
-            extreme = value
-        elif abs(value - extreme) > _REVERSAL_DEG:
-            side, extreme = (1.0 if value > extreme else -1.0), value
-        sides[i] = side
-    return sides
-
-
 @dataclass(frozen=True)
 class RestRecord:
     """A rest: its episode, its middle frame, the motors' mean angles (deg) and the sides they came from (-1, 0, 1)."""
@@ -216,7 +203,9 @@ def records_of(recording: Recording, angles: str, window_s: float, spread_deg: f
     records = []
     for stretch in recording.stretches:
         shown = (stretch.commanded if angles == "action" else stretch.reached)[:, turning]
-        approach = np.column_stack([_sides(command) for command in stretch.commanded[:, turning].T])
+        approach = np.column_stack(
+            [last_motions(command, _REVERSAL_DEG) for command in stretch.commanded[:, turning].T]
+        )
         for rest in rests(np.radians(shown.T), [], stretch.time, still):
             frame, mean = int(stretch.frame[(rest.start + rest.stop) // 2]), shown[rest.start : rest.stop].mean(axis=0)
             records.append(RestRecord(stretch.episode, frame, mean, approach[rest.stop - 1]))

@@ -20,8 +20,8 @@ _PURPOSE = "reading recordings of ROS 2"
 _MOST_DELAYS = 4096
 _ZERO, _SAME = "with the stamp zero", "with the stamp of the one before"
 _EARLIER = "with a stamp before that of an earlier one"
+# A larger part of the messages, and times are not to be trusted
 _MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01})
-"""A larger part of the messages, and times are not to be trusted."""
 Clock = Literal["header", "receive"]
 
 
@@ -66,11 +66,7 @@ class Stamps:
         return float(np.median(self._delays)) if self._delays else float("nan")
 
     def check(self, place: str) -> list[str]:
-        """What was left out, sentences; times that are useless altogether are refused.
-
-        Raises:
-            DataError: stamps are zero, constant or backwards in too many messages.
-        """
+        """What was left out, sentences; refused if stamps are zero, constant or backwards in too many messages."""
         for cause, most in _MOST.items():
             if (count := self.faults[cause]) > max(most * self.count, 1):
                 what = cause.removeprefix("with ")
@@ -96,11 +92,7 @@ _RECOVER = (
 
 
 class Bag:
-    """A recording (folder or file), whose messages are read from its files by ``rosbags`` whenever they are asked for.
-
-    Raises:
-        DataError: it is none.
-    """
+    """A recording (folder or file); ``rosbags`` reads its messages from the files whenever they are asked for."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -118,10 +110,6 @@ class Bag:
     def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[tuple[Topic, int, bytes, Any]]:
         """The messages of chosen topics, of each file by their time: when they were received (ns since 1970), their
         bytes, and what rosbags made of them.
-
-        Raises:
-            DataError: a file is no recording, or is cut off or damaged.
-            PluginError: rosbags is not there.
         """
         rosbag2, typesys = (library(f"rosbags.{name}", _PURPOSE) for name in ("rosbag2", "typesys"))
         types, unread = typesys.get_typestore(typesys.Stores.LATEST), Counter[Topic]()

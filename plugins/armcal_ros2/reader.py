@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 from array import array
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from armcal.calibration.rigid_chain import nominal_tools
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
-from armcal.measure.rests import StillSettings, deviations_of_mean, judged, mean_pose, rests
+from armcal.measure.rests import StillSettings, deviations_of_mean, judged, last_motions, mean_pose, rests
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
@@ -58,19 +57,19 @@ class RestSettings(Settings):
 
 @dataclass(frozen=True)
 class JointRest:
-    """A rest of the joints: begin and end (s), means and standard deviations by joint (rad or m)."""
+    """A rest of the joints: begin and end (s); by joint."""
 
     begin: float
     end: float
-    means: Array
-    scatter: Array
+    means: Array  # rad or m
+    scatter: Array  # standard deviations
+    approach: Array  # the sign of the last motion; 0 where there was none
 
 
 class JointLog:
-    """Joint states as they come: rests, and directions of motion.
+    """Joint states as they come, by their names in the recording; once it is closed, the rests among them.
 
-    ``names`` are those of the recording, and ``slides`` says which of these joints slide. ``rests`` are complete once
-    it is closed: also shorter ones than a rest's window, to be listed.
+    ``slides`` says which of these joints slide. Rests shorter than the window are there too, to be listed.
     """
 
     def __init__(
@@ -82,14 +81,10 @@ class JointLog:
         self._still = still
         self._places: dict[tuple[str, ...], list[int]] = {}
         self._times, self._rows = array("d"), array("d")
-        self._turned_at: list[tuple[float, Array]] = []
-        self._furthest: Array | None = None
-        self._direction = np.zeros(len(self.names))
         self._before: list[Array] = []  # where the joints were last, and where before that, apart
         self._returns = 0
         self._others = set[str]()
-        self._stated = settings.topic
-        self.topic = settings.topic  # if none was stated, the first that has joint states
+        self._stated = settings.topic  # if none is, the first that has joint states
         self.stamps = Stamps(settings.topic or "", settings.stamps)
         self.largest = np.zeros(len(self.names))  # absolute positions, by joint (rad or m), once it is closed
         self.rests: list[JointRest] = []
@@ -98,12 +93,10 @@ class JointLog:
         return topic.type == JOINT_STATE and self._stated in (None, topic.name)
 
     def add(self, topic: Topic, message: Any, received: int) -> None:
-        """The next message, a sensor_msgs/JointState."""
-        if self.topic is None:
-            self.topic = self.stamps.topic = topic.name
-        if topic.name != self.topic:
+        if topic.name != (self.stamps.topic or topic.name):
             self._others.add(topic.name)
             return
+        self.stamps.topic = topic.name
         names = tuple(message.name)
         if names not in self._places:
             self._places[names] = [names.index(name) for name in self.names if name in names]
@@ -118,21 +111,29 @@ class JointLog:
         if len(message.position) != len(names) or not (np.abs(row := message.position[places]) < _LARGEST).all():
             self.stamps.faults[_NO_POSITION] += 1
             return
-        self._take(time, row * self._scale)
+        row = row * self._scale
+        if self._before and (np.abs(row - self._before[0]) > _JUMP * self._limits).any():
+            self._returns += int((np.abs(row - self._before[-1]) <= self._limits).all())
+            self._before.insert(1, self._before[0])
+        self._before[:] = [row, *self._before[1:2]]
+        if not self._times or time - self._times[-1] >= _THINNED_S:
+            self._times.append(time)
+            self._rows.extend(row.tolist())
 
     def close(self, place: str) -> list[str]:
-        """The end of the recording: what was left out, sentences.
-
-        Raises:
-            DataError: nothing in it can be used.
-        """
+        """The end of the recording: what was left out, sentences; refused if nothing can be used."""
         times, rows = np.array(self._times), np.array(self._rows).reshape(-1, len(self.names)).T
         self.largest = np.abs(rows).max(axis=1, initial=0.0)
         still = StillSettings.si(window=self._still.window / 2, spread=1.0)
+        motions = np.array([last_motions(row, limit) for row, limit in zip(rows, self._limits, strict=True)])
         for rest in rests(rows / self._limits[:, None], (), times, still):
-            self.rests.append(self._rest(times[rest.start : rest.stop], rows[:, rest.start : rest.stop]))
-        topic, count, named = self.topic, self.stamps.count, set().union(*self._places)
-        if self._others or topic is None or not (named or count):
+            begin, end, joints = float(times[rest.start]), float(times[rest.stop - 1]), rows[:, rest]
+            settled = (times[rest] >= begin + self._still.settle) & (times[rest] <= end - GUARD_S)
+            joints = joints[:, settled] if settled.any() else joints
+            approach = motions[:, rest.stop - 1]
+            self.rests.append(JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1), approach))
+        topic, count, named = self.stamps.topic, self.stamps.count, set().union(*self._places)
+        if self._others or not topic or not (named or count):
             text = f"found {', '.join(sorted(filter(None, (topic, *self._others)))) or 'no topic'} with joint states"
             hint = "Set joints: {topic: NAME} in the data section; armcal bag info lists what is there."
             refuse(place, f"{text}, expected one.", hint)
@@ -155,36 +156,6 @@ class JointLog:
             text = f"{topic} is silent {silent.sum()} times, for up to {pauses[longest]:.1f} s"
             remarks.append(f"{text} (from {times[longest]:.2f}): a rest ends there.")
         return remarks
-
-    def approach(self, time: float) -> Array:
-        """The sign of each joint's last motion before a time; 0 where it has not moved."""
-        place = bisect_right(self._turned_at, time, key=lambda entry: entry[0])
-        return self._turned_at[place - 1][1] if place else np.zeros(len(self.names))
-
-    def _take(self, time: float, row: Array) -> None:
-        if self._before and (np.abs(row - self._before[0]) > _JUMP * self._limits).any():
-            self._returns += int((np.abs(row - self._before[-1]) <= self._limits).all())
-            self._before.insert(1, self._before[0])
-        self._before[:] = [row, *self._before[1:2]]
-        if not self._times or time - self._times[-1] >= _THINNED_S:
-            self._times.append(time)
-            self._rows.extend(row.tolist())
-        if self._furthest is None:
-            self._furthest = row
-        moved = row - self._furthest
-        beyond = np.abs(moved) > self._limits
-        if beyond.any():
-            self._furthest = np.where(beyond, row, self._furthest)
-            direction = np.where(beyond, np.sign(moved), self._direction)
-            if (direction != self._direction).any():
-                self._turned_at.append((time, direction))
-                self._direction = direction
-
-    def _rest(self, times: Array, rows: Array) -> JointRest:
-        begin, end = float(times[0]), float(times[-1])
-        settled = (times >= begin + self._still.settle) & (times <= end - GUARD_S)
-        joints = rows[:, settled] if settled.any() else rows
-        return JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1))
 
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -272,12 +243,10 @@ class MeasuredLog:
         self._moved_at: float | None = None
 
     def reads(self, topic: Topic) -> bool:
-        """Whether messages of a topic are for it: its own, and transforms that hold for good."""
         is_static = self.settings.reference is not None and topic.name.endswith(_STATIC)
         return topic.type in self.types and (topic.name == self.settings.topic or is_static)
 
     def add(self, topic: Topic, message: Any, received: int) -> None:
-        """The next message of a topic that it reads."""
         if topic.type == TRANSFORMS:
             self._follow(message, received, topic.name.endswith(_STATIC))
             return
@@ -288,18 +257,12 @@ class MeasuredLog:
         if time is None:
             return
         body, position, orientation = _FIELDS[topic.type]
-        held = getattr(message, body) if body else message
-        q = getattr(held, orientation) if orientation else None
-        p = getattr(held, position)
-        turn = None if q is None else np.array([q.x, q.y, q.z, q.w])
-        self._take(time, np.array([p.x, p.y, p.z]), turn)
+        content = getattr(message, body) if body else message
+        p, q = getattr(content, position), getattr(content, orientation) if orientation else None
+        self._take(time, np.array([p.x, p.y, p.z]), None if q is None else np.array([q.x, q.y, q.z, q.w]))
 
     def close(self, place: str) -> list[str]:
-        """What was left out, sentences.
-
-        Raises:
-            DataError: nothing was measured, or its frames are not those that were asked for.
-        """
+        """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for."""
         s, count = self.settings, self.stamps.count
         where = f"{place}, data.measurements.{self.instance}"
         if s.reference is not None and not count:
@@ -321,7 +284,6 @@ class MeasuredLog:
         return remarks
 
     def seen(self, rests: Sequence[JointRest], still: RestSettings) -> list[_Seen]:
-        """What it saw in each rest once the arm had settled."""
         samples, offset = np.array(self._samples).reshape(-1, 8), self.settings.clock_offset
         spans = np.array([(rest.begin + still.settle, rest.end - GUARD_S) for rest in rests]) + offset
         return [self._seen(samples[slice(*span)], still.drift) for span in np.searchsorted(samples[:, 0], spans)]
@@ -432,12 +394,7 @@ class Rosbag2Reader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """The means of all rests that were measured, in SI; the other rests are set aside with their reasons.
-
-        Raises:
-            DataError: there is no such recording, topic, frame or joint, or no rest that was measured.
-            PluginError: rosbags is not there.
-        """
+        """The means of all rests that were measured, in SI; the other rests are set aside with their reasons."""
         s, bag, digest = self._settings, Bag(self._settings.path), hashlib.sha256()
         unknown = sorted(set(s.measurements) - set(request.measurements))
         have = ", ".join(request.measurements) or "none"
@@ -491,7 +448,6 @@ class Rosbag2Reader:
         return channels
 
     def _require(self, log: MeasuredLog, types: Mapping[str, str]) -> None:
-        """Refuse a topic that is not there, or whose messages (types by topic) measure nothing."""
         topic = log.settings.topic
         if types.get(topic) in log.types:
             return
@@ -506,10 +462,9 @@ class Rosbag2Reader:
     def _dataset(
         self, request: ReadRequest, names: list[str], joints: JointLog, logs: Sequence[MeasuredLog], remarks: list[str]
     ) -> Dataset:
-        """A record a rest."""
         rests, still, place = joints.rests, self._settings.still, str(self._settings.path)
         means = np.array([rest.means for rest in rests]).T
-        sides = np.array([joints.approach(rest.end) for rest in rests]).T
+        sides = np.array([rest.approach for rest in rests]).T
         channels = dict(zip(names, means, strict=True))
         channels |= {name.replace(".", ".approach.", 1): own for name, own in zip(names, sides, strict=True)}
         channels["time"] = np.array([(rest.begin + rest.end) / 2 for rest in rests])
@@ -544,7 +499,6 @@ class Rosbag2Reader:
     def _refuse_inverted(
         self, request: ReadRequest, name: str, channels: Mapping[str, Array], seen: Sequence[_Seen]
     ) -> None:
-        """Refuse poses whose inverses move as the nominal tools do."""
         own = request.measurements[name].arms[0]
         joints = np.array([channels[f"{own}.{joint}"] for joint in request.arms[own].commanded]).T
         if is_inverted(nominal_tools(request.arms[own], joints), np.array([one.pose for one in seen])):
@@ -567,11 +521,7 @@ class Rosbag2Reader:
         return [f"{text}, set clock_offset_s: {apart:.3f} for {log.instance}."]
 
     def _measured(self, name: str, request: ReadRequest, seen: Sequence[_Seen]) -> dict[str, Array]:
-        """The channels of a measurement, NaN where it saw nothing.
-
-        Raises:
-            DataError: it reads what no pose has, or orientations of points.
-        """
+        """The channels of a measurement, NaN where it saw nothing."""
         poses = np.array([one.pose for one in seen])
         turned = np.isfinite(poses[:, 0, 0])
         values = {axis: poses[:, i, 3] for i, axis in enumerate("xyz")}
