@@ -34,8 +34,8 @@ from armcal_export.content import REPORT, in_equilibrium
 
 CASES = 24
 FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
+# Operations: slopes of more are evaluated column by column, so that they compile in seconds and fit small memories
 MOST_WHOLE = 12000
-"""Operations: slopes of more are evaluated column by column, so that they compile in seconds and fit small memories."""
 _FEW_PASSES, _MANY_PASSES = 2, 30
 _TOLERANCE = 1e-12  # m, and entries of rotation matrices
 _PAYLOAD_KG, _FORCE_N = 0.05, 0.5
@@ -55,14 +55,10 @@ _LIBRARY = {**LIBRARY, "SIN": "sin", "COS": "cos"}
 
 
 class CExportSettings(Settings):
-    """How the C code names things, and what it is told.
-
-    Attributes:
-        conditions: of the surroundings that the code is told (``temperature``; C); others are as in the calibration.
-    """
+    """How the C code names things, and what it is told."""
 
     prefix: str = ""  # of every name in the code; the arm's name unless given
-    conditions: tuple[str, ...] = ()
+    conditions: tuple[str, ...] = ()  # of the surroundings (``temperature``; C); others are as in the calibration
 
     @field_validator("prefix")
     @classmethod
@@ -73,8 +69,6 @@ class CExportSettings(Settings):
 
 
 class CExporter:
-    """Source, header and test program."""
-
     Settings: ClassVar[type[CExportSettings]] = CExportSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"prefix": "left"}
     holds_residual: ClassVar[bool] = True
@@ -84,13 +78,7 @@ class CExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The code, compiled without a warning and run against armcal's own poses where there is a compiler.
-
-        Raises:
-            InputError: the file's name is no C file's, or a condition is not the arm's.
-            NotConvergedError: the arm settles in no pose.
-            ProblemError: the compiler warns, or the compiled code differs.
-        """
+        """The code, compiled without a warning and run against armcal's own poses where there is a compiler."""
         out, conditions = request.out or "arm.c", self._settings.conditions
         if not _NAME.fullmatch(out):
             raise InputError(
@@ -124,7 +112,6 @@ class CExporter:
 
 
 def _content(request: ExportRequest, e: ToolExpression) -> dict[str, Any]:
-    """What stands in the places of the templates."""
     origin, units = request.origin, {"angle": "rad", "length": "m"}
     dated = [
         f"Calibrated {origin.created}" if origin.created else "",
@@ -180,11 +167,7 @@ def _servos(e: ToolExpression) -> dict[str, Any]:
 
 
 def _cases(e: ToolExpression) -> list[tuple[str, str, str]]:
-    """Random poses within the limits, of two one under a further payload and force, that settle: input, tool, efforts.
-
-    Raises:
-        NotConvergedError: none settles.
-    """
+    """Random poses within the limits that settle, every other one under a further load: input, tool, efforts."""
     random = np.random.default_rng(2)
     records, joints = e.records(random_commands(e.arm, CASES)).T.copy(), len(e.joints)
     records[:, joints : 2 * joints] = random.integers(-1, 2, (CASES, joints))
@@ -243,11 +226,7 @@ def _function(inputs: list[Expression], outputs: list[Expression]) -> ca.Functio
 
 
 def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> str:
-    """A function of SX as a static C function ``name(inputs, outputs)``, every argument an array of doubles.
-
-    Raises:
-        ConfigError: an operation has no form in C99.
-    """
+    """A function of SX as a static C function ``name(inputs, outputs)``, every argument an array of doubles."""
     values: dict[int, str] = {}
     lines = [f"(void){text};" for text in (*inputs, *outputs)]
     for k in range(function.n_instructions()):
@@ -279,7 +258,6 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
 
 
 def c_number(value: float) -> str:
-    """A number as C99 reads it back to the last bit."""
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):
@@ -316,11 +294,7 @@ def filled(template: str, prefix: str, **content: Any) -> str:
 
 
 def _compiled_and_run(sources: Mapping[str, bytes], source: str, test: str) -> list[str]:
-    """What is to be remarked: nothing, or that no compiler is there.
-
-    Raises:
-        ProblemError: the compiler warns, or the program finds differences.
-    """
+    """What is to be remarked: nothing, or that no compiler is there."""
     compiler = find_compiler()
     if compiler is None:
         return ["not compiled and not compared here: no C compiler was found (cc, gcc or clang)"]

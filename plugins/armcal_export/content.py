@@ -10,17 +10,14 @@ from armcal.arm.evaluator import Evaluator
 from armcal.arm.model import Chain, forward
 from armcal.arm.statics import MOUNT_FRAME, STATICS, TOOL_FRAME, Load, frame_names, tilted
 from armcal.base.arrays import Array, Mask
-from armcal.calibration.exporter import ExportRequest, random_commands, rigid_tools
+from armcal.calibration.exporter import ExportRequest
 from armcal.calibration.rigid_chain import RigidChain, rigid_chain
 from armcal.calibration.tool_expression import ToolExpression
-from armcal.errors import ProblemError
-from scipy.spatial.transform import Rotation
 
 REPORT = "Nothing was written. Please report this with the calibration."
 _LOADS = (-3.0, -0.5, 0.1, 2.0)
 _COMMANDS = ((0.0, 0.0), (0.7, 1.0), (-1.1, -1.0))  # Commanded displacements (rad or m) and approaches
 _LINEAR = 1e-12
-_TOLERANCE = 1e-12  # m, and entries of rotation matrices, for each metre and radian that a pose is made of
 
 
 @dataclass(frozen=True)
@@ -37,8 +34,6 @@ class ArmSpring:
 
 @dataclass(frozen=True)
 class ArmMass:
-    """A mass of the arm."""
-
     name: str
     mass_kg: float
     com_m: list[float]  # in the base frame with all commands zero
@@ -58,11 +53,6 @@ class ArmContent:
 
 
 def content_of(request: ExportRequest) -> ArmContent:
-    """What formats hold of an arm.
-
-    Raises:
-        ProblemError: the tool hangs on a joint before the last.
-    """
     values = {name: ca.SX(list(map(float, value))) for name, value in request.values.items()}
     chain, nothing = request.arm.chain(values), ca.SX.zeros(3)
     tilt = {name.removeprefix(f"{STATICS}."): ca.SX(float(value[0])) for name, value in request.tilt.items()}
@@ -114,38 +104,6 @@ def _masses(request: ExportRequest, chain: Chain) -> tuple[ArmMass, ...]:
 
 def _numbers(expression: ca.SX) -> list[float]:
     return [float(number) for number in np.asarray(ca.evalf(ca.densify(expression)).full()).ravel()]
-
-
-def rebuilt_tools(rigid: RigidChain, commands: Array) -> Array:
-    """base_T_tool (N x 4 x 4) at commands (commanded joints x N), by the product of exponentials of the joints' screws.
-
-    [Murray1994]
-    """
-    given = dict(zip([joint.name for joint in rigid.joints if joint.mimic is None], commands, strict=True))
-    tools = np.tile(np.eye(4), (commands.shape[1], 1, 1))
-    for joint in rigid.joints:
-        mimic = joint.mimic
-        q = given[joint.name] if mimic is None else mimic.multiplier * given[mimic.master] + mimic.offset
-        moved, motion = joint.scale * q, np.tile(np.eye(4), (commands.shape[1], 1, 1))
-        turns, slides = (joint.pitch * moved, moved) if joint.slides else (moved, joint.pitch * moved)
-        motion[:, :3, :3] = Rotation.from_rotvec(turns[:, None] * joint.axis).as_matrix()
-        motion[:, :3, 3] = slides[:, None] * joint.axis
-        tools = tools @ joint.base_T_joint @ motion @ np.linalg.inv(joint.base_T_joint)
-    return np.asarray(tools @ rigid.base_T_tool)
-
-
-def require_same_tools(request: ExportRequest, read: RigidChain) -> None:
-    """What was read back must put the tool where the rigid arm has it.
-
-    Raises:
-        ProblemError: it does not.
-    """
-    commands = random_commands(request.arm)
-    expected = rigid_tools(request.arm, request.values, commands)
-    apart = float(np.abs(rebuilt_tools(read, commands) - expected).max())
-    allowed = _TOLERANCE * max(1.0, float(np.abs(expected).max()), float(np.abs(commands).max(initial=0.0)))
-    if not apart <= allowed:
-        raise ProblemError(f"what reads back is {apart:.3g} m or 1 off the calibrated arm.", hint=REPORT)
 
 
 def in_equilibrium(expression: ToolExpression, records: Array) -> tuple[Array, Array, Mask]:

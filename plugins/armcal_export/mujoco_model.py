@@ -61,18 +61,12 @@ class MujocoExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The model.
-
-        Raises:
-            InputError: MuJoCo is not installed, or the arm has joints that MJCF has not.
-            ProblemError: MuJoCo's arm is another one.
-        """
         arm = content_of(request)
         require_plain_axes(arm.rigid, "mujoco")
         environment = request.environment
         payload = (environment.payload_mass if request.payload_stated else 0.0, environment.payload_com)
         content = mjcf(arm, payload, hinges_of(arm.springs), self._settings)
-        loaded = _loaded(content, arm.rigid)
+        loaded = LoadedModel(content, arm.rigid)
         commands = random_commands(request.arm, POSES)
         tools = np.array([loaded.rigid_tool(command) for command in commands.T])
         apart = float(np.abs(tools - rigid_tools(request.arm, request.values, commands)).max())
@@ -237,30 +231,18 @@ def _row(numbers: Sequence[float] | Array) -> str:
     return " ".join(repr(float(number)) for number in numbers)
 
 
-def _loaded(content: bytes, rigid: RigidChain) -> "LoadedModel":
-    try:
-        return LoadedModel(content, rigid)
-    except ModuleNotFoundError as fault:
-        raise InputError(
-            "the format mujoco needs MuJoCo, which is not installed.", hint="Install it: pip install armcal[mujoco]."
-        ) from fault
-    except ValueError as fault:
-        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
-
-
 class LoadedModel:
-    """A model that MuJoCo took.
-
-    Raises:
-        ModuleNotFoundError: MuJoCo is not installed.
-        ValueError: it refuses the model.
-    """
-
     def __init__(self, content: bytes, rigid: RigidChain) -> None:
-        import mujoco
+        try:
+            import mujoco
 
-        self._mujoco: Any = mujoco
-        self._model: Any = self._mujoco.MjModel.from_xml_string(content.decode("utf-8"))
+            self._mujoco: Any = mujoco
+            self._model: Any = mujoco.MjModel.from_xml_string(content.decode("utf-8"))
+        except ModuleNotFoundError as fault:
+            text = "the format mujoco needs MuJoCo, which is not installed."
+            raise InputError(text, hint="Install it: pip install armcal[mujoco].") from fault
+        except ValueError as fault:
+            raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
         self._data: Any = self._mujoco.MjData(self._model)
         self._rigid = rigid
         self._site = self._model.site("tool").id
@@ -274,11 +256,7 @@ class LoadedModel:
         return self._tool()
 
     def tool_at_rest(self, command: Array) -> Array:
-        """base_T_tool (4 x 4) where the springs balance gravity and the joints stand at their commands.
-
-        Raises:
-            NotConvergedError: they find no balance.
-        """
+        """base_T_tool (4 x 4) where the springs balance gravity and the joints stand at their commands."""
         self._set(command)
         if len(self._springs):
             self._settle()
