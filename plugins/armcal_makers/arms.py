@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 
 HASH = re.compile(r"calib_\d+")
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+# Frames of a calibrated arm further off the nominal ones are of another arm, or in other units
 FARTHEST_M, FARTHEST_RAD = 0.03, math.radians(5)
-"""Frames of a calibrated arm further off the nominal ones are of another arm, or in other units."""
 _LONGEST_M, _WIDEST = 3.0, 2 * math.pi + 1e-6
 _AGAIN = "Extract the file from the robot again."
 _UNKNOWN = "Check units (m, rad), or use a URDF of the arm itself."
+# A frame as near to its nominal one stays where it is; another is shifted along its axis, and turned about it
 _NEAR_M, _NEAR_RAD = 0.02, 0.1
-"""A frame as near to its nominal one stays where it is; another is shifted along its axis, and turned about it."""
 _ALONG = 0.9  # cosine to an axis beyond which a direction says too little of what is across it
 _UR_JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", *(f"wrist_{i}_joint" for i in (1, 2, 3)))
 _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -34,8 +34,6 @@ _UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"
 
 @dataclass(frozen=True)
 class Family:
-    """Arms whose calibrations are written alike."""
-
     format: str  # what armcal calls their file
     base: str  # the frame that the first transform starts from, in the maker's own URDF
     flange: str  # the frame of the last joint, there
@@ -73,11 +71,7 @@ def nominal_arms() -> Mapping[str, Nominal]:
 
 
 def nearest(candidates: Mapping[str, Array], where: Location | None = None) -> Nominal:
-    """The nearest of the arms by whose names ``candidates`` has frames (parent_T_joint, n x 4 x 4).
-
-    Raises:
-        DataError: the frames are near to none.
-    """
+    """The nearest of the arms by whose names ``candidates`` has frames (parent_T_joint, n x 4 x 4)."""
     arms, off = nominal_arms(), {}
     for name, frames in candidates.items():
         shifts, turns = differences(at_zero(frames), at_zero(arms[name].frames))
@@ -165,11 +159,7 @@ class MakersArm:
 
 
 def read_kinematics(text: str, path: Path) -> MakersArm:
-    """An arm from the text of a maker's file; ``path`` names it in messages.
-
-    Raises:
-        DataError: what was found, what was expected, the line, and what to do.
-    """
+    """An arm from the text of a maker's file; ``path`` names it in messages."""
     if text.lstrip().startswith("[") or "\n[mounting]" in text:
         hint = "Extract it from the robot with ur_calibration."
         refuse(path, "found a controller's calibration.conf, expected the kinematics YAML of the robot.", hint)

@@ -27,7 +27,6 @@ from armcal_makers.arms import (
     UR,
     XARM,
     Family,
-    Nominal,
     about_z,
     at_zero,
     differences,
@@ -60,17 +59,17 @@ class XarmExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The YAML, read again and compared in 1,000 poses.
-
-        Raises:
-            ConfigError: it is no arm of this maker, or its hash is not known.
-            ProblemError: a joint has a pitch, or what was written is not the calibrated arm.
-        """
+        """The YAML, read again and compared in 1,000 poses."""
         scope = f"{request.name}.{request.arm.model_name}."
         values = {n.removeprefix(scope): v for n, v in request.values.items() if n.startswith(scope)}
         chain = numeric_chain(request.arm.model, values)
         axes, flange = _at_zero(chain, self.family)
-        nominal = self._nominal(axes)
+        candidates = {}  # the arm whose links are nearest
+        for name, arm in nominal_arms().items():
+            if arm.family is self.family and len(arm.frames) == len(axes):
+                drawn = at_zero(arm.frames)
+                candidates[name] = _between(placed(axes, drawn[-1], drawn))
+        nominal = nearest(candidates)
         drawn = at_zero(nominal.frames)
         shifted, turned = differences(flange[None], drawn[-1:])
         near = shifted[0] <= FARTHEST_M and turned[0] <= FARTHEST_RAD
@@ -81,20 +80,19 @@ class XarmExporter:
         text = (head + yaml.safe_dump(content, sort_keys=False)).encode()
         left = np.linalg.solve(zero[-1], flange)
         written = read_kinematics(text.decode(), Path(request.out or "kinematics.yaml"))
-        _compare(request, chain, self.family, written.frames, left)
+        commands = random_commands(request.arm).T
+        poses = _flange_poses(chain, self.family, commands)[1]
+        apart, turned_by = largest_difference(poses, tips(written.frames, commands) @ left)
+        if not (apart <= TOLERANCE and turned_by <= 10 * TOLERANCE):
+            raise ProblemError(
+                f"what would be written is {apart:.3g} m and {turned_by:.3g} rad off the calibrated arm, "
+                f"expected {TOLERANCE:g} at most.",
+                hint="Nothing was written. Please report this with the calibration.",
+            )
         return Exported(text, changed_numbers(request), tuple(request.arm.effects), remarks=_of_tool(left))
 
     def _more(self, request: ExportRequest) -> Mapping[str, str]:
         return {}
-
-    def _nominal(self, axes: Array) -> Nominal:
-        """The arm whose links are nearest."""
-        candidates = {}
-        for name, arm in nominal_arms().items():
-            if arm.family is self.family and len(arm.frames) == len(axes):
-                drawn = at_zero(arm.frames)
-                candidates[name] = _between(placed(axes, drawn[-1], drawn))
-        return nearest(candidates)
 
 
 class UrExporter(XarmExporter):
@@ -152,19 +150,7 @@ def _at_zero(chain: Chain, family: Family) -> tuple[Array, Array]:
     return np.asarray(np.linalg.solve(base, np.array(frames))), flange[0]
 
 
-def _compare(request: ExportRequest, chain: Chain, family: Family, frames: Array, left: Array) -> None:
-    commands = random_commands(request.arm).T
-    apart, turned = largest_difference(_flange_poses(chain, family, commands)[1], tips(frames, commands) @ left)
-    if not (apart <= TOLERANCE and turned <= 10 * TOLERANCE):
-        raise ProblemError(
-            f"what would be written is {apart:.3g} m and {turned:.3g} rad off the calibrated arm, "
-            f"expected {TOLERANCE:g} at most.",
-            hint="Nothing was written. Please report this with the calibration.",
-        )
-
-
 def _of_tool(left: Array) -> tuple[str, ...]:
-    """Where the tool is on the flange, if it is not there."""
     x, y, z, *angles = six_of(left)
     if max(map(abs, (x, y, z, *angles))) <= _NOTHING:
         return ()

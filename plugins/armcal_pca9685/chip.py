@@ -28,8 +28,6 @@ _TRIES = 3
 
 
 class Channel(NamedTuple):
-    """What stands in a channel's two registers."""
-
     on: int
     off: int
 
@@ -41,7 +39,6 @@ class Channel(NamedTuple):
         return (self.off - self.on) % COUNTS or None
 
     def pack(self) -> bytes:
-        """As it is written, from the channel's first register on."""
         return self.on.to_bytes(2, "little") + self.off.to_bytes(2, "little")
 
     @staticmethod
@@ -82,13 +79,7 @@ class Chip:
     def prepare(self, foreign_pulses: ForeignPulses) -> None:
         """Make it ready. Pulses that run with the right prescale go on untouched; none begins.
 
-        Args:
-            foreign_pulses: what becomes of pulses of another set-up: they are a reason to refuse, or are ended (the
-                servos let go).
-
-        Raises:
-            DeviceRefusedError: it is set up otherwise while it makes pulses, or it counts an external clock.
-            DeviceError: its set-up does not read back.
+        Pulses of another set-up are a reason to refuse, or are ended (the servos let go).
         """
         mode1 = self._read(MODE1, 1)[0]
         if mode1 & EXTCLK:
@@ -115,11 +106,7 @@ class Chip:
         self._check_set_up()
 
     def check(self) -> None:
-        """Find out whether it is still as ``prepare`` left it.
-
-        Raises:
-            DeviceResetError: it is not; its power failed, probably.
-        """
+        """Find out whether it is still as ``prepare`` left it; if not, its power failed, probably."""
         for _ in range(_TRIES):
             mode1 = self._read(MODE1, 1)[0]
             if mode1 == AUTO_INCREMENT:
@@ -141,11 +128,7 @@ class Chip:
         )
 
     def set_channel(self, channel: int, pulse: Channel) -> None:
-        """Write a channel's four registers in one transaction, and read them back; once more if they differ.
-
-        Raises:
-            DeviceError: they differ still.
-        """
+        """Write a channel's four registers in one transaction, and read them back; once more if they differ."""
         register, data = channel_register(channel), pulse.pack()
         for _ in range(2):
             self._link.write(self._address, bytes((register,)) + data)

@@ -11,7 +11,7 @@ from armcal.devices.framed import messages
 from armcal.devices.framed.frames import Frame, FrameDecoder, encoded
 from armcal.devices.link import GuardedLink
 from armcal_pca9685.device import Pca9685Device
-from armcal_pca9685.framed_link import FramedLink
+from armcal_pca9685.links import FramedLink
 from board_bench import JOINTS, PtyBoard, servo_file, written
 
 from tests.simulated_lines.pca9685_model import ADDRESS_ONLY
