@@ -99,13 +99,23 @@ class Bag:
         self.topics = Counter[Topic]()  # how many messages each has; complete once messages were asked for
         self.remarks: list[str] = []  # what of it is missing or could not be read, sentences
         self._files = [path]
-        if path.is_dir():
-            self._look_inside()
-        elif not path.exists():
+        if not path.exists():
             refuse(path, "there is no such file or folder.", "Check the spelling and the directory.")
-        elif path.suffix not in _KINDS:
+        if not path.is_dir() and path.suffix not in _KINDS:
             hint = "Convert it with rosbags-convert." if path.suffix == ".bag" else _EXPECTED
             refuse(path, f"found the ending {path.suffix or 'none'}, expected .mcap or .db3.", hint)
+        for journal in path.glob("*.db3-wal"):
+            if journal.stat().st_size:
+                self._remark(
+                    f"{journal.name} holds messages that are not read: its recorder was killed. To have them, run "
+                    f"sqlite3 {journal.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'."
+                )
+        if path.is_dir() and not (path / _METADATA).exists():  # which names its files
+            files = [file for file in path.iterdir() if file.suffix in _KINDS]
+            if not files:
+                refuse(path, f"found no {_METADATA} and no file .mcap or .db3 in it.", _EXPECTED)
+            self._files = sorted(files, key=lambda file: [int(n) for n in re.findall(r"\d+", file.name)])
+            self._remark(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
 
     def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[tuple[Topic, int, bytes, Any]]:
         """The messages of chosen topics, of each file by their time: when they were received (ns since 1970), their
@@ -138,19 +148,3 @@ class Bag:
     def _remark(self, text: str) -> None:
         if text not in self.remarks:
             self.remarks.append(text)
-
-    def _look_inside(self) -> None:
-        """A folder's metadata.yaml names its files; without one, they are read in the order of their numbers."""
-        for journal in self.path.glob("*.db3-wal"):
-            if journal.stat().st_size:
-                self._remark(
-                    f"{journal.name} holds messages that are not read: its recorder was killed. To have them, run "
-                    f"sqlite3 {journal.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'."
-                )
-        if (self.path / _METADATA).exists():
-            return
-        files = [file for file in self.path.iterdir() if file.suffix in _KINDS]
-        if not files:
-            refuse(self.path, f"found no {_METADATA} and no file .mcap or .db3 in it.", _EXPECTED)
-        self._files = sorted(files, key=lambda file: [int(n) for n in re.findall(r"\d+", file.name)])
-        self._remark(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")

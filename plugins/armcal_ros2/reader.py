@@ -6,7 +6,7 @@ import hashlib
 import math
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from types import MappingProxyType
@@ -195,39 +195,14 @@ class MeasuredSettings(TopicSettings):
         return self
 
 
-class _Tree:
-    """The newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)."""
-
-    def __init__(self) -> None:
-        self.edges: dict[str, tuple[str, Array, float | None]] = {}
-
-    def between(self, reference: str, frame: str) -> tuple[list[str], Array] | None:
-        """The frames on the way from one to another, and the pose of the latter in the former; None without a way."""
-        above, beside = self._above(frame), self._above(reference)
-        if above[-1] != beside[-1]:
-            return None
-        while above and beside and above[-1] == beside[-1]:  # what is above both does not matter
-            above.pop(), beside.pop()
-        return [*above, *beside], np.linalg.inv(self._pose(beside)) @ self._pose(above)
-
-    def _pose(self, names: Sequence[str]) -> Array:
-        return reduce(lambda pose, name: self.edges[name][1] @ pose, names, np.eye(4))
-
-    def _above(self, frame: str) -> list[str]:
-        names = [frame]
-        while names[-1] in self.edges and self.edges[names[-1]][0] not in names:
-            names.append(self.edges[names[-1]][0])
-        return names
-
-
 @dataclass(frozen=True)
 class _Seen:
-    """What a measurement saw in a rest: a mean pose (4 x 4), the deviation of its place (m), or why there is none."""
+    """What a measurement saw in a rest."""
 
-    pose: Array
-    deviation: float = float("nan")
+    pose: Array  # the mean (4 x 4)
+    deviation: float = math.nan  # of its place (m)
     samples: int = 0
-    fault: str = ""
+    fault: str = ""  # why there is none
 
 
 class MeasuredLog:
@@ -238,7 +213,8 @@ class MeasuredLog:
         self.stamps = Stamps(settings.topic, settings.stamps)
         self.types = tuple(_FIELDS) if settings.reference is None else (TRANSFORMS,)
         self._samples = array("d")  # 8 each: s, m, quaternion xyzw
-        self._tree = _Tree()
+        # the newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)
+        self._edges: dict[str, tuple[str, Array, float | None]] = {}
         self._frames = Counter[str]()
         self._moved_at: float | None = None
 
@@ -266,7 +242,7 @@ class MeasuredLog:
         s, count = self.settings, self.stamps.count
         where = f"{place}, data.measurements.{self.instance}"
         if s.reference is not None and not count:
-            frames = ", ".join(sorted({*self._tree.edges, *(edge[0] for edge in self._tree.edges.values())}))
+            frames = ", ".join(sorted({*self._edges, *(edge[0] for edge in self._edges.values())}))
             text = f"found no way from the frame {s.reference} to {s.frame} in {s.topic}; its frames are"
             refuse(where, f"{text} {frames[:400] or 'none'}.", "Correct frame and reference.")
         listed = ", ".join(f"{name or 'none'} ({some})" for name, some in self._frames.most_common())
@@ -315,20 +291,33 @@ class MeasuredLog:
             pose, place, child = np.eye(4), part.transform.translation, part.child_frame_id.lstrip("/")
             pose[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
             pose[:3, 3] = (place.x, place.y, place.z)
-            self._tree.edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
+            self._edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
             changed.add(child)
-        way = self._tree.between((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
-        if way is None or changed.isdisjoint(way[0]):
+        above, beside = self._above(s.frame or ""), self._above(s.reference or "")
+        between = {*above} ^ {*beside}  # what is above both does not matter
+        if above[-1] != beside[-1] or changed.isdisjoint(between):
             return
         # where several frames move, the oldest says when all of the pose was seen
-        times = (self._tree.edges[name][2] for name in way[0])
+        times = (self._edges[name][2] for name in between)
         oldest = min((at for at in times if at is not None), default=None)
         if oldest is None or oldest == self._moved_at:
             return
         self._moved_at = oldest
         time = self.stamps.time(round(oldest * 1e9), received)
         if time is not None:
-            self._take(time, way[1][:3, 3], Rotation.from_matrix(way[1][:3, :3]).as_quat())
+            in_root, reference = (
+                reduce(lambda pose, name: self._edges[name][1] @ pose, names[:-1], np.eye(4))
+                for names in (above, beside)
+            )
+            pose = np.linalg.inv(reference) @ in_root
+            self._take(time, pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat())
+
+    def _above(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on to the root."""
+        names = [frame.lstrip("/")]
+        while names[-1] in self._edges and self._edges[names[-1]][0] not in names:
+            names.append(self._edges[names[-1]][0])
+        return names
 
     def _take(self, time: float, position: Array, turn: Array | None) -> None:
         if not np.isfinite(position).all():
@@ -415,9 +404,12 @@ class Rosbag2Reader:
                     log.add(topic, content, received)
         remarks = joints.close(str(s.path))
         rests = joints.rests
-        self._refuse_degrees(
-            request, channels, np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest
-        )
+        turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
+        largest = np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest
+        for name, position in zip(channels, largest, strict=True):
+            if name in turning and position > _FULL_TURN:
+                hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
+                self._refuse(f"{name} stands at {position:.6g} rad, more than one turn (2 pi rad).", hint)
         if not rests:
             hint = "Let the arm stand at each pose, or give a wider spread_deg or a shorter window_s under still."
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
@@ -474,7 +466,14 @@ class Rosbag2Reader:
         for log in logs:
             name, own = log.instance, seen[log.instance]
             channels |= self._measured(name, request, own)
-            self._refuse_inverted(request, name, channels, own)
+            arm = request.measurements[name].arms[0]
+            angles = np.array([channels[f"{arm}.{joint}"] for joint in request.arms[arm].commanded]).T
+            if is_inverted(nominal_tools(request.arms[arm], angles), np.array([one.pose for one in own])):
+                text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm"
+                mend = f"Set inverted: {str(not log.settings.inverted).lower()} for {name}."
+                self._refuse(
+                    f"{text} does.", mend if log.settings.reference is None else "Exchange frame and reference."
+                )
             remarks += self._clock_remarks(log, joints, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)
@@ -495,17 +494,6 @@ class Rosbag2Reader:
         warnings = tuple(f"{place}: {remark}" for remark in (*remarks, f"{text}."))
         rows = tuple(range(1, len(rests) + 1))
         return Dataset(ids, channels, extra, rows, place, warnings=warnings).without(faulty)
-
-    def _refuse_inverted(
-        self, request: ReadRequest, name: str, channels: Mapping[str, Array], seen: Sequence[_Seen]
-    ) -> None:
-        own = request.measurements[name].arms[0]
-        joints = np.array([channels[f"{own}.{joint}"] for joint in request.arms[own].commanded]).T
-        if is_inverted(nominal_tools(request.arms[own], joints), np.array([one.pose for one in seen])):
-            settings = self._settings.measurements[name]
-            mend = f"Set inverted: {str(not settings.inverted).lower()} for {name}."
-            text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm does"
-            self._refuse(f"{text}.", mend if settings.reference is None else "Exchange frame and reference.")
 
     def _clock_remarks(self, log: MeasuredLog, joints: JointLog, seen: Sequence[_Seen]) -> list[str]:
         """By the times of receipt the clocks differ, or a point moves while the joints rest, as if they did."""
@@ -538,14 +526,6 @@ class Rosbag2Reader:
             topic = self._settings.measurements[name].topic
             self._refuse(f"{name} reads orientations, and {topic} has points.", "Set type: tip_position.")
         return {f"{name}.{own}": values[own] for own in needed}
-
-    def _refuse_degrees(self, request: ReadRequest, names: Iterable[str], positions: Array) -> None:
-        """Angles beyond one turn of joints that do not turn on and on."""
-        turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
-        for name, largest in zip(names, positions, strict=True):
-            if name in turning and largest > _FULL_TURN:
-                hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
-                self._refuse(f"{name} stands at {largest:.6g} rad, more than one turn (2 pi rad).", hint)
 
     def _refuse(self, message: str, hint: str) -> NoReturn:
         refuse(self._settings.path, message, hint)
