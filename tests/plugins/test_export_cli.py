@@ -154,4 +154,4 @@ def test_what_is_no_calibration_is_refused(tmp_path, content):
 def test_mujoco_that_is_not_installed_is_told(calibration, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     ran = armcal("export", calibration, "--format", "mujoco", "--out", tmp_path / "x.xml")
-    assert (ran.exit_code, "pip install armcal[mujoco]" in ran.stderr) == (2, True)
+    assert (ran.exit_code, "pip install 'armcal[mujoco]'" in ran.stderr) == (2, True)

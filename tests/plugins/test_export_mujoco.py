@@ -153,7 +153,7 @@ def test_names_of_a_urdf_stay_names_in_the_model():
 
 def test_without_mujoco_the_export_is_refused_with_the_way_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"pip install armcal\[mujoco\]"):
+    with pytest.raises(InputError, match=r"pip install 'armcal\[mujoco\]'"):
         exported(LRM)
 
 
