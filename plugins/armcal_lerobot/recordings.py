@@ -163,7 +163,6 @@ def _stretches(rows: Array, scale: Array) -> Iterator[Stretch]:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[Any]:
-    """A parquet file, opened; what the library raises of a damaged one is a DataError with the file."""
     parquet = library("pyarrow.parquet", "reading LeRobot's data sets")
     try:
         with parquet.ParquetFile(path, memory_map=True) as table:

@@ -3,11 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-from armcal.arm.servo import COUNTS, PulseClock, PulseTable, quantised
+from armcal.arm.servo import COUNTS, quantised
 from armcal.base.settings import InputPath, Settings
 from armcal.config.servo_file import CalibratedServo, ServoFile, digest, load_servo_file
 from armcal.devices.clock import Clock
@@ -30,32 +29,19 @@ _ANGLE_SLACK = 1e-9
 _COUNT_SLACK = 1e-6
 
 
-@dataclass(frozen=True)
 class Servo:
-    """A servo as the servo file has it; tables and clocks are looked up once, for every step needs them."""
+    """A servo as the servo file has it; what every step needs is computed once."""
 
-    calibrated: CalibratedServo
-    pulse_range: tuple[float, float]
-
-    @cached_property
-    def place(self) -> tuple[int, int]:
-        return self.calibrated.address, self.calibrated.channel
-
-    @cached_property
-    def clock(self) -> PulseClock:
-        return self.calibrated.clock
-
-    @cached_property
-    def span(self) -> tuple[float, float]:
-        """The smallest and the largest angle that its table has (rad); an end may be rounded over."""
+    def __init__(self, calibrated: CalibratedServo, pulse_range: tuple[float, float]) -> None:
+        self.calibrated, self.pulse_range = calibrated, pulse_range
+        self.place = calibrated.address, calibrated.channel
+        self.table, self.clock = calibrated.table, calibrated.clock
+        # the smallest and the largest angle that its table has (rad); an end may be rounded over
         ends = self.table.angles[0], self.table.angles[-1]
         rounded = [float(quantised(end, self.table, self.clock)) for end in ends]
-        return min(ends[0], rounded[0]) - _ANGLE_SLACK, max(ends[1], rounded[1]) + _ANGLE_SLACK
-
-    @cached_property
-    def allowed_counts(self) -> tuple[int, int]:
-        low, high = (pulse / self.clock.tick for pulse in self.pulse_range)
-        return math.ceil(low - _COUNT_SLACK), math.floor(high + _COUNT_SLACK)
+        self.span = min(ends[0], rounded[0]) - _ANGLE_SLACK, max(ends[1], rounded[1]) + _ANGLE_SLACK
+        low, high = (pulse / self.clock.tick for pulse in pulse_range)
+        self.allowed_counts = math.ceil(low - _COUNT_SLACK), math.floor(high + _COUNT_SLACK)
 
     def counts(self, angle: float) -> int:
         """Nearest to an angle (rad), within its pulse range."""
@@ -63,12 +49,7 @@ class Servo:
         return min(max(int(self.clock.counts(self.table.pulse(angle))), fewest), most)
 
     def angle(self, counts: int) -> float:
-        """The angle (rad) that so many counts ask for."""
         return float(self.table.angle(counts * self.clock.tick))
-
-    @cached_property
-    def table(self) -> PulseTable:
-        return self.calibrated.table
 
 
 class Pca9685Settings(Settings):

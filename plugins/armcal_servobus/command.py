@@ -242,9 +242,17 @@ def home(
     Afterwards the servos report the angles at which you hold the arm, or those that a calibration found: of the joints
     that are named, or of all. The differences are shown first, and how to take them back.
     """
+    from armcal.calibration.calibration import zeros_of
+
     with _opened(config, overrides) as (servos, checks):
         degrees, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
-        zeros = {} if calibration is None else _zeros(console, calibration, arm_name, servos.joints)
+        zeros: dict[str, float] = {}  # rad
+        if calibration is not None:
+            computed, reasons = zeros_of(calibration, arm_name, console.registry())
+            for name, reason in reasons.items():
+                console.warn(f"{name} keeps its zero: {reason}.")
+            by_local = {name: name.rpartition(".")[2] for name in servos.joints}
+            zeros = {n: math.radians(computed[local].degrees) for n, local in by_local.items() if local in computed}
         for name in (*degrees, *counts):
             if name not in servos.joints:
                 listed = ", ".join(servos.joints)
@@ -271,17 +279,6 @@ def home(
     console.line("the offsets are written and read back.")
     if calibration is not None:
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
-
-
-def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping[str, ServoJoint]) -> dict[str, float]:
-    """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
-    from armcal.calibration.calibration import zeros_of
-
-    zeros, reasons = zeros_of(calibration, arm, console.registry())
-    for name, reason in reasons.items():
-        console.warn(f"{name} keeps its zero: {reason}.")
-    by_local = {name: name.rpartition(".")[2] for name in joints}
-    return {name: math.radians(zeros[local].degrees) for name, local in by_local.items() if local in zeros}
 
 
 def _numbers(stated: Sequence[str], number: Callable[[str], Number], example: str) -> dict[str, Number]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from functools import cached_property
 from typing import Annotated, Literal, NamedTuple
 
 from armcal.arm.servo import teeth_text
@@ -96,22 +95,12 @@ class ServoJoint:
         self.name, self.settings = name, settings
         self.id, self.model = settings.id, MODELS[settings.model]
         self.label = f"{name} (id {self.id})"
-
-    @cached_property
-    def count_range(self) -> tuple[int, int]:
-        """The lowest and the highest count of its range; beyond 0 or the last one where the range crosses the seam.
-
-        One count beyond is none: a range of the whole turn, -180 to 180 deg, ends where it begins.
-        """
-        ends = sorted(map(self.exact_count, self.settings.range))
+        ends = sorted(map(self.exact_count, settings.range))
         low, high = math.ceil(ends[0] - _SLACK), math.floor(ends[1] + _SLACK)
-        return (0 if low == -1 else low), (COUNTS - 1 if high == COUNTS else high)
-
-    @property
-    def crosses_seam(self) -> bool:
-        """Whether the last count is followed by zero inside its range: it can be read there, and not be driven."""
-        low, high = self.count_range
-        return low < 0 or high >= COUNTS
+        # One count beyond the turn is none: a range of the whole turn, -180 to 180 deg, ends where it begins
+        self.count_range = (0 if low == -1 else low), (COUNTS - 1 if high == COUNTS else high)
+        # The last count is followed by zero inside its range: it can be read there, and not be driven
+        self.crosses_seam = self.count_range[0] < 0 or self.count_range[1] >= COUNTS
 
     def angle(self, count: float) -> float:
         return self.settings.direction * STEP * (count - self.settings.zero_count)
