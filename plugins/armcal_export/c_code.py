@@ -30,7 +30,7 @@ from armcal.functions.compiler import find_compiler
 from armcal.io.plain_files import writing
 from pydantic import field_validator
 
-from armcal_export.content import REPORT, in_equilibrium
+from armcal_export.description import REPORT, in_equilibrium
 
 CASES = 24
 FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")

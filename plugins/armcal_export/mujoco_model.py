@@ -33,7 +33,7 @@ from armcal.plugins import library
 from pydantic import Field
 from scipy.optimize import root
 
-from armcal_export.content import REPORT, ArmContent, ArmMass, ArmSpring, content_of, in_equilibrium
+from armcal_export.description import REPORT, ArmContent, ArmMass, ArmSpring, content_of, in_equilibrium
 
 TOLERANCE = 1e-9  # m, and entries of rotation matrices, of the rigid arm
 NO_MASS_KG = 1e-9  # What MuJoCo is told of a body without a mass: it refuses none, and this bends nothing

@@ -13,7 +13,7 @@ import pytest
 from armcal.calibration.exporter import random_commands, request_of, rigid_tools
 from armcal.errors import InputError, ProblemError
 from armcal_export import mujoco_model
-from armcal_export.content import content_of
+from armcal_export.description import content_of
 from armcal_export.mujoco_model import Hinge, LoadedModel, MujocoExporter, MujocoSettings, mjcf
 
 from tests.made_calibrations import following_arm, made_calibration
