@@ -5,6 +5,7 @@ is there: two servos with one id are seen by how they answer together.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from types import MappingProxyType
@@ -310,13 +311,9 @@ class Bus:
         return heard
 
     def _exchange(self, packet: bytes, servos: frozenset[int], count: int | None, wait_s: float) -> Received:
-        """Send a packet, and take answers until those of all servos are there or time is up.
+        """Send a packet, and take answers of so many bytes (None: any) until all servos have answered, or time is up.
 
-        Args:
-            packet: an echo of it is taken away.
-            servos: whose answers; where it is one, a damaged one ends the waiting.
-            count: how many bytes an answer to this packet has, if it is no refusal; None: any.
-            wait_s: at most.
+        An echo is taken away. Where one servo is asked, a damaged answer ends the waiting.
         """
         self._send(packet)
         answers: list[Status] = []
@@ -362,10 +359,7 @@ class FoundServo:
     temperature_C: int | None = None
     alarms: tuple[str, ...] = ()  # in words
     damaged: int = 0  # so many of its answers were damaged, or followed by another one
-
-    @property
-    def is_doubled(self) -> bool:
-        return self.damaged >= _AGAIN
+    doubled: bool = False  # so many that two servos have its id
 
 
 def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
@@ -392,16 +386,13 @@ def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
 def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo | None:
     """What a servo says of itself; None: nothing. It is read several times, for two with one id do not answer alike."""
     before = bus.counts["damaged"] + bus.counts["extra"]
-    numbers: dict[str, int] = {}
+    names, numbers = ("model", "firmware", "position", "voltage", "temperature"), dict[str, int]()
     for _ in range(times):
-        try:
-            names = ("model", "firmware", "position", "voltage", "temperature")
+        with suppress(DeviceError):
             numbers = {name: bus.number(servo, name) for name in names}
-        except DeviceError:
-            continue
     damaged = bus.counts["damaged"] + bus.counts["extra"] - before
     if not numbers:
-        return FoundServo(servo, 0, None, damaged=damaged) if damaged else None
+        return FoundServo(servo, 0, None, damaged=damaged, doubled=damaged >= _AGAIN) if damaged else None
     firmware, protocol = numbers["firmware"], bus.settings.protocol
     return FoundServo(
         servo,
@@ -413,4 +404,5 @@ def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo | None:
         temperature_C=numbers["temperature"],
         alarms=bus.alarms(servo),
         damaged=damaged,
+        doubled=damaged >= _AGAIN,
     )

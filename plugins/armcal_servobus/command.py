@@ -64,7 +64,7 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
                 raise
             finally:
                 wires.close()
-            if results := [{"baud": rate, **asdict(one), "doubled": one.is_doubled} for one in servos if one]:
+            if results := [{"baud": rate, **asdict(one)} for one in servos if one]:
                 there[spoken] = [*there.get(spoken, []), *results]
     if not there:
         text = f"no servo answers at {'these baud rates' if baud else 'any baud rate'}, ids 0 to {last_id}."

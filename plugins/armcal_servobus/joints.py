@@ -196,7 +196,7 @@ class Servos:
                 listed = ", ".join(map(str, strangers))
                 mend = f"Found the id {listed}, which no joint has: is that the servo? Then give it the id {joint.id}."
                 mistakes.append(Mistake(joint.label, "does not answer", mend if strangers else SILENT_MEND))
-            elif servo.is_doubled:
+            elif servo.doubled:
                 what = f"answers damaged or twice ({servo.damaged} times)"
                 mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
                 mistakes.append(Mistake(joint.label, what, mend))
