@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -130,33 +130,22 @@ _SCHEMA = 1
 _HEAD = f"# A calibrated robot arm; {SCHEMA_FILE} says what each field means. Units are SI, angles in rad.\n"
 
 
-class DescriptionSettings(Settings):
-    """What is written beside the description.
-
-    Attributes:
-        beside: ``schema`` writes the JSON schema into the same folder, ``nothing`` leaves it out.
-    """
-
-    beside: Literal["schema", "nothing"] = "schema"
-
-
 class YamlExporter:
     """As YAML."""
 
-    Settings: ClassVar[type[DescriptionSettings]] = DescriptionSettings
+    Settings: ClassVar[type[Settings]] = Settings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {}
 
-    def __init__(self, settings: DescriptionSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: Settings) -> None:
+        pass
 
     def export(self, request: ExportRequest) -> Exported:
         description = described(request)
         content = self.written(description)
         if self.read(content) != description:
             raise ProblemError("what reads back is not the calibrated arm to the last digit.", hint=REPORT)
-        schema = resources.files("armcal_export").joinpath(SCHEMA_FILE)
-        beside = {SCHEMA_FILE: schema.read_bytes()} if self._settings.beside == "schema" else {}
-        return Exported(content, changed_numbers(request), companions=beside)
+        schema = resources.files("armcal_export").joinpath(SCHEMA_FILE).read_bytes()
+        return Exported(content, changed_numbers(request), companions={SCHEMA_FILE: schema})
 
     def written(self, description: Mapping[str, Any]) -> bytes:
         text = yaml.dump(

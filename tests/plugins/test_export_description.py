@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from armcal.base.settings import Settings
 from armcal.calibration.exporter import ExportRequest, Origin, random_commands, request_of, rigid_tools
 from armcal.errors import ProblemError
 from armcal.testing.planar import planar_arms
-from armcal_export.description import SCHEMA_FILE, DescriptionSettings, JsonExporter, YamlExporter
+from armcal_export.description import SCHEMA_FILE, JsonExporter, YamlExporter
 from scipy.linalg import expm
 
 from tests.made_calibrations import following_arm, made_calibration
@@ -30,8 +31,8 @@ ARMS = {
 }
 
 
-def exported(kind, request, **settings):
-    return EXPORTERS[kind](DescriptionSettings(**settings)).export(request)
+def exported(kind, request):
+    return EXPORTERS[kind](Settings()).export(request)
 
 
 def request_for(name):
@@ -180,10 +181,6 @@ def test_files_are_as_the_shipped_schema_says(name, kind):
         spoilt = json.loads(json.dumps(told))
         damage(spoilt)
         assert not fits(spoilt, shipped, shipped)
-
-
-def test_the_schema_can_be_left_out():
-    assert exported("json", request_for("urdf"), beside="nothing").companions == {}
 
 
 def test_what_reads_back_as_another_arm_is_not_written(monkeypatch):
