@@ -14,8 +14,21 @@ from armcal.cli.common import FILE, Console, speaking
 from armcal.errors import DataError
 from armcal.io.plain_files import refuse, require_new, write_new
 
-from armcal_ros2.bag import CAMERA_INFO, IMAGES, JOINT_STATE, Bag, Stamps, nanoseconds
-from armcal_ros2.reader import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
+from armcal_ros2.reader import (
+    CAMERA_INFO,
+    GUARD_S,
+    IMAGES,
+    JOINT_STATE,
+    MEASURED,
+    TRANSFORMS,
+    Bag,
+    JointLog,
+    JointRest,
+    JointsSettings,
+    RestSettings,
+    Stamps,
+    nanoseconds,
+)
 
 _MOST_FRAMES = 200
 _LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once

@@ -17,10 +17,9 @@ from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
-from armcal_servobus.bus import LAST_ID, Bus, BusSettings, looked_at, present
+from armcal_servobus.bus import BAUD_RATES, COUNTS, LAST_ID, STEP, Bus, BusSettings, ProtocolName, looked_at, present
 from armcal_servobus.device import ServoBusSettings, ServoStreamSettings
-from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos, check_offset
-from armcal_servobus.models import BAUD_RATES, COUNTS, STEP, ProtocolName
+from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos
 
 _SECTION = "bench"
 _KINDS: Mapping[str, type[ServoJointsSettings]] = {"device": ServoBusSettings, "joints": ServoStreamSettings}
@@ -185,7 +184,7 @@ def planned(
         change_deg = math.degrees(joint.settings.direction * _nearest(moved) * STEP)
         plans.append(Homing(joint, position, before, after, (position + moved) % COUNTS, change_deg))
         try:
-            check_offset(joint.model, after)
+            joint.model.check_offset(after)
         except ValueError as fault:
             mends.append(f"{name}: {fault}")
     if mends:

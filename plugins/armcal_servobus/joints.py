@@ -6,14 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Literal, NamedTuple
 
-from armcal.arm.servo import teeth_text
 from armcal.base.settings import Settings, UnitOf
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.errors import Location
 from pydantic import Field, field_validator, model_validator
 
-from armcal_servobus.bus import LAST_ID, SILENT_MEND, Bus, BusSettings, looked_at, present
-from armcal_servobus.models import COUNTS, MODELS, STEP, ServoModel
+from armcal_servobus.bus import COUNTS, LAST_ID, MODELS, SILENT_MEND, STEP, Bus, BusSettings, looked_at, present
 
 SEVERAL_TURNS = 0x10  # Of a Feetech servo's phase: it reports angles of several turns
 _SLACK = 1e-9
@@ -48,7 +46,7 @@ class BusJointSettings(Settings):
         if self.range[1] - self.range[0] > 2 * math.pi + STEP:
             raise ValueError("the range is wider than a turn, and an encoder knows no more: narrow it")
         if self.offset is not None:
-            check_offset(MODELS[self.model], self.offset)
+            MODELS[self.model].check_offset(self.offset)
         return self
 
 
@@ -121,21 +119,6 @@ class ServoJoint:
             raise DeviceRefusedError(text, where=Location(field=f"joints.{self.name}.range"), hint=hint)
         count = round(self.exact_count(angle))
         return min(max(count, self.count_range[0]), self.count_range[1])
-
-
-def check_offset(model: ServoModel, offset: int) -> None:
-    """Raise ValueError if a servo cannot hold a homing offset; it says what to do."""
-    limit = model.map.offset_limit
-    if (beyond := abs(offset) - limit) <= 0:
-        return
-    amount = f"its horn by {math.degrees(beyond * STEP):.0f} deg or more"
-    if model.teeth:
-        tooth = COUNTS / model.teeth
-        amount = "it by " + teeth_text(math.ceil(beyond / tooth), math.degrees(tooth * STEP))
-    raise ValueError(
-        f"found an offset of {offset} counts, expected -{limit} to {limit}, which is all that a {model.name} holds: "
-        f"remount {amount}"
-    )
 
 
 def drivable(joints: Iterable[ServoJoint]) -> None:

@@ -14,8 +14,8 @@ import recorded_bags as bags
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
-from armcal_ros2.bag import Bag
 from armcal_ros2.bag_command import survey
+from armcal_ros2.reader import Bag
 from rosbags.rosbag2 import Reader
 
 KINDS = [("mcap", ""), ("mcap", "storage"), ("sqlite3", "")]
