@@ -303,20 +303,17 @@ def _compiled_and_run(sources: Mapping[str, bytes], source: str, test: str) -> l
         for name, content in sources.items():
             Path(directory, name).write_bytes(content)
         program = str(Path(directory, "test-program"))
-        _run([compiler, *FLAGS, "-o", program, source, test, "-lm"], directory, "does not compile")
-        _run([program], directory, "differs from the calibrated arm")
+        for command, failing in (
+            ([compiler, *FLAGS, "-o", program, source, test, "-lm"], "does not compile"),
+            ([program], "differs from the calibrated arm"),
+        ):
+            try:
+                done = subprocess.run(command, cwd=directory, capture_output=True, timeout=_LIMIT_S, check=False)
+            except (OSError, subprocess.TimeoutExpired) as fault:
+                hint = "Set ARMCAL_CC=none to do without."
+                raise ProblemError(f"the C code cannot be tested here: {fault}.", hint=hint) from fault
+            if done.returncode:
+                said = (done.stderr or done.stdout).decode(errors="replace").strip().splitlines()
+                faults = [line for line in said if "error" in line] or said or [f"exit code {done.returncode}"]
+                raise ProblemError(f"the C code {failing}: {' | '.join(faults[:4])[:500]}.", hint=REPORT)
     return []
-
-
-def _run(command: list[str], directory: str, failing: str) -> None:
-    try:
-        done = subprocess.run(
-            command, cwd=directory, capture_output=True, text=True, errors="replace", timeout=_LIMIT_S, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired) as fault:
-        hint = "Set ARMCAL_CC=none to do without."
-        raise ProblemError(f"the C code cannot be tested here: {fault}.", hint=hint) from fault
-    if done.returncode:
-        said = (done.stderr or done.stdout).strip().splitlines()
-        faults = [line for line in said if "error" in line] or said or [f"exit code {done.returncode}"]
-        raise ProblemError(f"the C code {failing}: {' | '.join(faults[:4])[:500]}.", hint=REPORT)

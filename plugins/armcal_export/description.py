@@ -226,7 +226,13 @@ def described(request: ExportRequest) -> dict[str, Any]:
             }
             for name, (table, clock) in request.expression().servos.items()
         ],
-        "parameters": _parameters(request),
+        "parameters": [
+            {
+                **{name: getattr(entry, name) for name in ("name", "unit", "nominal", "value", "free", "sd")},
+                "determined": entry.determined_by and entry.determined_by == "data",
+            }
+            for entry in request.entries
+        ],
     }
 
 
@@ -246,23 +252,6 @@ def _joint(joint: RigidJoint) -> dict[str, Any]:
         "follows": mimic
         and {"joint": mimic.master, "multiplier": float(mimic.multiplier), "offset": float(mimic.offset)},
     }
-
-
-def _parameters(request: ExportRequest) -> list[dict[str, Any]]:
-    if request.entries:
-        names, entries = ("name", "unit", "nominal", "value", "free", "sd"), request.entries
-        by_data = [one.determined_by and one.determined_by == "data" for one in entries]
-        described = [{name: getattr(entry, name) for name in names} for entry in entries]
-        return [{**own, "determined": by} for own, by in zip(described, by_data, strict=True)]
-    blocks = {block.name: block for block in request.arm.parameters()}
-    unknown = {"free": False, "sd": None, "determined": None}
-    return [
-        {"name": name, "unit": unit, "nominal": nominal, "value": float(value), **unknown}
-        for key, numbers in request.values.items()
-        for name, unit, nominal, value in zip(
-            blocks[key].entry_names, blocks[key].entry_units, blocks[key].nominal, numbers, strict=True
-        )
-    ]
 
 
 def _pose(matrix: Array) -> dict[str, Any]:

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import yaml
 from armcal.base.settings import Settings
-from armcal.calibration.exporter import ExportRequest, Origin, random_commands, request_of, rigid_tools
+from armcal.calibration.exporter import Origin, random_commands, request_of, rigid_tools
 from armcal.errors import ProblemError
-from armcal.testing.planar import planar_arms
 from armcal_export.description import SCHEMA_FILE, JsonExporter, YamlExporter
 from scipy.linalg import expm
 
@@ -200,10 +199,3 @@ def test_texts_of_any_kind_survive(kind):
     told = read_description(exported(kind, request).content)
     assert (told["calibration"]["experiment"], told["calibration"]["created"]) == (request.origin.experiment, "no")
     assert told["calibration"]["software"] == {"on": "1e5"}
-
-
-def test_an_arm_without_a_calibration_behind_it_is_described_too():
-    arm = planar_arms(["arm"])["arm"]
-    request = ExportRequest("arm", arm, {b.name: np.array(b.nominal) for b in arm.parameters()})
-    told = read_description(exported("yaml", request).content)
-    assert {p["name"]: p["value"] for p in told["parameters"]}["arm.planar.a1"] == 0.3
