@@ -249,7 +249,7 @@ WITH = {
     "convex": "from armcal_cvxpy.estimator import CvxpyEstimator",
     "figures": "from matplotlib.backends.backend_agg import FigureCanvasAgg",
     "lerobot": "import pyarrow.parquet",
-    "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); import armcal_pca9685.linux_i2c",
+    "i2c": "import smbus2; smbus2.i2c_msg.write(64, [0]); import armcal_pca9685.links",
     "mujoco": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco><worldbody/></mujoco>')",
     "camera": "import cv2; cv2.aruco.CharucoBoard((5, 4), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(0))",
     "ros2": "import rosbags.rosbag2, rosbags.typesys",

@@ -30,12 +30,12 @@ from armcal.functions.compiler import find_compiler
 from armcal.io.plain_files import writing
 from pydantic import field_validator
 
-from armcal_export.content import REPORT, in_equilibrium
+from armcal_export.description import REPORT, in_equilibrium
 
 CASES = 24
 FLAGS = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
+# Operations: slopes of more are evaluated column by column, so that they compile in seconds and fit small memories
 MOST_WHOLE = 12000
-"""Operations: slopes of more are evaluated column by column, so that they compile in seconds and fit small memories."""
 _FEW_PASSES, _MANY_PASSES = 2, 30
 _TOLERANCE = 1e-12  # m, and entries of rotation matrices
 _PAYLOAD_KG, _FORCE_N = 0.05, 0.5
@@ -55,14 +55,10 @@ _LIBRARY = {**LIBRARY, "SIN": "sin", "COS": "cos"}
 
 
 class CExportSettings(Settings):
-    """How the C code names things, and what it is told.
-
-    Attributes:
-        conditions: of the surroundings that the code is told (``temperature``; C); others are as in the calibration.
-    """
+    """How the C code names things, and what it is told."""
 
     prefix: str = ""  # of every name in the code; the arm's name unless given
-    conditions: tuple[str, ...] = ()
+    conditions: tuple[str, ...] = ()  # of the surroundings (``temperature``; C); others are as in the calibration
 
     @field_validator("prefix")
     @classmethod
@@ -73,8 +69,6 @@ class CExportSettings(Settings):
 
 
 class CExporter:
-    """Source, header and test program."""
-
     Settings: ClassVar[type[CExportSettings]] = CExportSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"prefix": "left"}
     holds_residual: ClassVar[bool] = True
@@ -84,13 +78,7 @@ class CExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The code, compiled without a warning and run against armcal's own poses where there is a compiler.
-
-        Raises:
-            InputError: the file's name is no C file's, or a condition is not the arm's.
-            NotConvergedError: the arm settles in no pose.
-            ProblemError: the compiler warns, or the compiled code differs.
-        """
+        """The code, compiled without a warning and run against armcal's own poses where there is a compiler."""
         out, conditions = request.out or "arm.c", self._settings.conditions
         if not _NAME.fullmatch(out):
             raise InputError(
@@ -124,7 +112,6 @@ class CExporter:
 
 
 def _content(request: ExportRequest, e: ToolExpression) -> dict[str, Any]:
-    """What stands in the places of the templates."""
     origin, units = request.origin, {"angle": "rad", "length": "m"}
     dated = [
         f"Calibrated {origin.created}" if origin.created else "",
@@ -180,11 +167,7 @@ def _servos(e: ToolExpression) -> dict[str, Any]:
 
 
 def _cases(e: ToolExpression) -> list[tuple[str, str, str]]:
-    """Random poses within the limits, of two one under a further payload and force, that settle: input, tool, efforts.
-
-    Raises:
-        NotConvergedError: none settles.
-    """
+    """Random poses within the limits that settle, every other one under a further load: input, tool, efforts."""
     random = np.random.default_rng(2)
     records, joints = e.records(random_commands(e.arm, CASES)).T.copy(), len(e.joints)
     records[:, joints : 2 * joints] = random.integers(-1, 2, (CASES, joints))
@@ -243,11 +226,7 @@ def _function(inputs: list[Expression], outputs: list[Expression]) -> ca.Functio
 
 
 def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> str:
-    """A function of SX as a static C function ``name(inputs, outputs)``, every argument an array of doubles.
-
-    Raises:
-        ConfigError: an operation has no form in C99.
-    """
+    """A function of SX as a static C function ``name(inputs, outputs)``, every argument an array of doubles."""
     values: dict[int, str] = {}
     lines = [f"(void){text};" for text in (*inputs, *outputs)]
     for k in range(function.n_instructions()):
@@ -279,7 +258,6 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
 
 
 def c_number(value: float) -> str:
-    """A number as C99 reads it back to the last bit."""
     if math.isnan(value):
         return "NAN"
     if math.isinf(value):
@@ -316,11 +294,7 @@ def filled(template: str, prefix: str, **content: Any) -> str:
 
 
 def _compiled_and_run(sources: Mapping[str, bytes], source: str, test: str) -> list[str]:
-    """What is to be remarked: nothing, or that no compiler is there.
-
-    Raises:
-        ProblemError: the compiler warns, or the program finds differences.
-    """
+    """What is to be remarked: nothing, or that no compiler is there."""
     compiler = find_compiler()
     if compiler is None:
         return ["not compiled and not compared here: no C compiler was found (cc, gcc or clang)"]
@@ -329,20 +303,17 @@ def _compiled_and_run(sources: Mapping[str, bytes], source: str, test: str) -> l
         for name, content in sources.items():
             Path(directory, name).write_bytes(content)
         program = str(Path(directory, "test-program"))
-        _run([compiler, *FLAGS, "-o", program, source, test, "-lm"], directory, "does not compile")
-        _run([program], directory, "differs from the calibrated arm")
+        for command, failing in (
+            ([compiler, *FLAGS, "-o", program, source, test, "-lm"], "does not compile"),
+            ([program], "differs from the calibrated arm"),
+        ):
+            try:
+                done = subprocess.run(command, cwd=directory, capture_output=True, timeout=_LIMIT_S, check=False)
+            except (OSError, subprocess.TimeoutExpired) as fault:
+                hint = "Set ARMCAL_CC=none to do without."
+                raise ProblemError(f"the C code cannot be tested here: {fault}.", hint=hint) from fault
+            if done.returncode:
+                said = (done.stderr or done.stdout).decode(errors="replace").strip().splitlines()
+                faults = [line for line in said if "error" in line] or said or [f"exit code {done.returncode}"]
+                raise ProblemError(f"the C code {failing}: {' | '.join(faults[:4])[:500]}.", hint=REPORT)
     return []
-
-
-def _run(command: list[str], directory: str, failing: str) -> None:
-    try:
-        done = subprocess.run(
-            command, cwd=directory, capture_output=True, text=True, errors="replace", timeout=_LIMIT_S, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired) as fault:
-        hint = "Set ARMCAL_CC=none to do without."
-        raise ProblemError(f"the C code cannot be tested here: {fault}.", hint=hint) from fault
-    if done.returncode:
-        said = (done.stderr or done.stdout).strip().splitlines()
-        faults = [line for line in said if "error" in line] or said or [f"exit code {done.returncode}"]
-        raise ProblemError(f"the C code {failing}: {' | '.join(faults[:4])[:500]}.", hint=REPORT)

@@ -28,10 +28,12 @@ from armcal.calibration.exporter import (
     rigid_tools,
 )
 from armcal.calibration.rigid_chain import RigidChain, require_plain_axes
-from armcal.errors import InputError, NotConvergedError, ProblemError
+from armcal.errors import NotConvergedError, ProblemError
+from armcal.plugins import library
 from pydantic import Field
+from scipy.optimize import root
 
-from armcal_export.content import REPORT, ArmContent, ArmMass, ArmSpring, content_of, in_equilibrium
+from armcal_export.description import REPORT, ArmContent, ArmMass, ArmSpring, content_of, in_equilibrium
 
 TOLERANCE = 1e-9  # m, and entries of rotation matrices, of the rigid arm
 NO_MASS_KG = 1e-9  # What MuJoCo is told of a body without a mass: it refuses none, and this bends nothing
@@ -40,7 +42,7 @@ _RADIUS_M = 0.03
 """Masses are told as small balls: armcal knows their weight and centre, and not how they resist turning."""
 _COMMANDS = (-0.31, 0.42)
 _NO_SPRING = 1e-12  # rad/(N m) or m/N: what gives less than this is no spring
-_TURNS, _AT_REST, _FARTHEST, _DIFFERENCE = 60, 1e-12, 1.5, 1e-6
+_AT_REST, _FARTHEST = 1e-12, 1.5  # rad or m
 
 
 class MujocoSettings(Settings):
@@ -61,18 +63,12 @@ class MujocoExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The model.
-
-        Raises:
-            InputError: MuJoCo is not installed, or the arm has joints that MJCF has not.
-            ProblemError: MuJoCo's arm is another one.
-        """
         arm = content_of(request)
         require_plain_axes(arm.rigid, "mujoco")
         environment = request.environment
         payload = (environment.payload_mass if request.payload_stated else 0.0, environment.payload_com)
         content = mjcf(arm, payload, hinges_of(arm.springs), self._settings)
-        loaded = _loaded(content, arm.rigid)
+        loaded = LoadedModel(content, arm.rigid)
         commands = random_commands(request.arm, POSES)
         tools = np.array([loaded.rigid_tool(command) for command in commands.T])
         apart = float(np.abs(tools - rigid_tools(request.arm, request.values, commands)).max())
@@ -237,31 +233,14 @@ def _row(numbers: Sequence[float] | Array) -> str:
     return " ".join(repr(float(number)) for number in numbers)
 
 
-def _loaded(content: bytes, rigid: RigidChain) -> "LoadedModel":
-    try:
-        return LoadedModel(content, rigid)
-    except ModuleNotFoundError as fault:
-        raise InputError(
-            "the format mujoco needs MuJoCo, which is not installed.", hint="Install it: pip install armcal[mujoco]."
-        ) from fault
-    except ValueError as fault:
-        raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
-
-
 class LoadedModel:
-    """A model that MuJoCo took.
-
-    Raises:
-        ModuleNotFoundError: MuJoCo is not installed.
-        ValueError: it refuses the model.
-    """
-
     def __init__(self, content: bytes, rigid: RigidChain) -> None:
-        import mujoco
-
-        self._mujoco: Any = mujoco
-        self._model: Any = self._mujoco.MjModel.from_xml_string(content.decode("utf-8"))
-        self._data: Any = self._mujoco.MjData(self._model)
+        self._mujoco = library("mujoco", "the format mujoco")
+        try:
+            self._model = self._mujoco.MjModel.from_xml_string(content.decode("utf-8"))
+        except ValueError as fault:
+            raise ProblemError(f"MuJoCo does not take the model: {str(fault)[:300]}.", hint=REPORT) from fault
+        self._data = self._mujoco.MjData(self._model)
         self._rigid = rigid
         self._site = self._model.site("tool").id
         self._places = {joint.name: int(self._model.joint(joint.name).qposadr[0]) for joint in rigid.joints}
@@ -274,14 +253,13 @@ class LoadedModel:
         return self._tool()
 
     def tool_at_rest(self, command: Array) -> Array:
-        """base_T_tool (4 x 4) where the springs balance gravity and the joints stand at their commands.
-
-        Raises:
-            NotConvergedError: they find no balance.
-        """
+        """base_T_tool (4 x 4) where the springs balance gravity and the joints stand at their commands."""
         self._set(command)
         if len(self._springs):
-            self._settle()
+            rest = root(self._unbalanced, np.zeros(len(self._springs)), tol=_AT_REST)
+            if not (rest.success and np.abs(rest.x).max() < _FARTHEST):
+                raise NotConvergedError("the model in MuJoCo finds no balance.", hint="Check masses and compliances.")
+            self._data.qpos[self._springs] = rest.x
         return self._tool()
 
     def _set(self, command: Array) -> None:
@@ -292,28 +270,9 @@ class LoadedModel:
             self._data.qpos[self._places[joint.name]] = q + (joint.mimic.offset if joint.mimic else 0.0)
         self._data.qvel[:] = 0.0
 
-    def _settle(self) -> None:
-        """Newton's steps on spring torque minus weight, with slopes by differences."""
-        springs = self._springs
-        for _ in range(_TURNS):
-            missing = self._missing()
-            slope = np.empty((len(springs), len(springs)))
-            for column, place in enumerate(springs):
-                self._data.qpos[place] += _DIFFERENCE
-                slope[:, column] = (self._missing() - missing) / _DIFFERENCE
-                self._data.qpos[place] -= _DIFFERENCE
-            step = np.linalg.solve(slope, -missing)
-            longest = float(np.abs(step).max())
-            self._data.qpos[springs] += step * min(1.0, 0.3 / max(longest, _AT_REST))
-            if longest <= _AT_REST:
-                return
-            if not np.abs(self._data.qpos[springs]).max() < _FARTHEST:
-                break
-        if not longest <= 1e-9:
-            raise NotConvergedError("the model in MuJoCo finds no balance.", hint="Check masses and compliances.")
-
-    def _missing(self) -> Array:
-        """What keeps the springs from rest (N m or N): weight minus spring."""
+    def _unbalanced(self, deflections: Array) -> Array:
+        """What keeps springs that are bent so from rest (N m or N): weight minus spring."""
+        self._data.qpos[self._springs] = deflections
         self._mujoco.mj_forward(self._model, self._data)
         both = self._data.qfrc_bias - self._data.qfrc_passive
         return np.asarray(both[self._springs])

@@ -1,4 +1,4 @@
-"""``armcal lerobot``: what motor calibration files and data sets say of an arm, and calibrated zeros back into them."""
+"""``armcal lerobot``: motor calibration files checked and given calibrated zeros, rests taken out of data sets."""
 
 import sys
 from collections.abc import Sequence
@@ -12,7 +12,6 @@ from armcal.errors import InputError
 
 if TYPE_CHECKING:
     from armcal_lerobot.motor_files import Gripper, Units
-    from armcal_lerobot.recordings import Recording
 
 _ABOVE_ZERO = click.FloatRange(min=0, min_open=True)
 _UNITS = click.option(
@@ -34,24 +33,12 @@ _JOINTS = click.option(
 
 @click.group()
 def lerobot() -> None:
-    """LeRobot's motor calibration files and recorded data sets: checked, compared, and zeros written back."""
+    """LeRobot's motor calibration files and data sets: files checked, rests found, and zeros written back."""
 
 
 def _of_arm(command: Any) -> Any:
     config = click.option("--arm", "config", type=FILE, help="The arm's configuration or calibration: gives mm.")
     return config(_ARM_NAME(_JOINTS(command)))
-
-
-def _on_dataset(command: Any) -> Any:
-    text = "The follower's calibration file: turns percent into degrees."
-    return click.argument("dataset", type=FILE)(click.option("--calibration", type=FILE, help=text)(_UNITS(command)))
-
-
-def _recording(dataset: Path, units: "Units", calibration: Path | None) -> "Recording":
-    from armcal_lerobot.motor_files import read_motors
-    from armcal_lerobot.recordings import open_recording
-
-    return open_recording(dataset, units, read_motors(calibration) if calibration else None)
 
 
 @lerobot.command()
@@ -136,20 +123,9 @@ def zeros(
 
 
 @lerobot.command()
-@_on_dataset
-@speaking
-def compare(console: Console, dataset: Path, units: "Units", calibration: Path | None) -> None:
-    """How a follower follows its commands, joint by joint.
-
-    Offset, gain, backlash and delay from recorded data, with intervals.
-    """
-    from armcal_lerobot.tracking import compared
-
-    console.show(compared(_recording(dataset, units, calibration)))
-
-
-@lerobot.command()
-@_on_dataset
+@click.argument("dataset", type=FILE)
+@click.option("--calibration", type=FILE, help="The follower's calibration file: turns percent into degrees.")
+@_UNITS
 @click.option("--out", type=FILE, required=True, help="The CSV file to write, a row a rest.")
 @click.option("--window-s", type=_ABOVE_ZERO, default=0.5, show_default=True, help="How long no motor moves.")
 @click.option("--spread-deg", type=_ABOVE_ZERO, default=0.5, show_default=True, help="By more than this.")
@@ -173,11 +149,14 @@ def rests(
 
     A CSV to calibrate from, and a camera's images of these moments.
     """
-    from armcal_lerobot.recordings import records_of, write_images, write_records
+    from armcal_lerobot.motor_files import read_motors
+    from armcal_lerobot.recordings import is_copy, open_recording, records_of, write_images, write_records
 
     if (camera is None) != (images is None):
         raise InputError("found one of --camera and --images, expected both.", hint="Give both, or none.")
-    recording = _recording(dataset, units, calibration)
+    recording = open_recording(dataset, units, read_motors(calibration) if calibration else None)
+    if is_copy(recording):
+        console.warn("every state is a command: one was copied from the other, and nothing was measured of the arm.")
     records = records_of(recording, **how)
     if camera is not None and images is not None:
         write_images(recording, camera, records, images)

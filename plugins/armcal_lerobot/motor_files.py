@@ -39,8 +39,8 @@ _FARTHEST_DEG = 300.0  # No joint of an arm that LeRobot drives by these servos 
 _LONGER_DEG, _SAME_DEG, _NARROW_DEG = 60.0, 6.0, 40.0
 Units = Literal["degrees", "percent"]
 LAST_COUNT = 4095
+# Of Feetech SCS servos, and of files in degrees: LeRobot homes an STS servo about the middle of its 4096 counts
 _LAST_OF_SMALL, _WHOLE_DEG = 1023, 360
-"""Of Feetech SCS servos, and of files in degrees: LeRobot homes an STS servo about the middle of its 4096 counts."""
 COUNTS_A_TURN = 4096
 LARGEST_OFFSET = 2047
 DEGREES_A_COUNT = 360 / LAST_COUNT  # As LeRobot has it; a count of the encoder itself is 360 / 4096 deg
@@ -79,7 +79,6 @@ class Motor:
         return self.range_min == 0 and self.range_max == LAST_COUNT
 
     def degrees_in(self, units: Units) -> float:
-        """How many degrees one of the numbers is that LeRobot gives of this motor."""
         if units == "degrees":
             return 1.0
         sign = -1.0 if self.drive_mode else 1.0  # LeRobot inverts percent by the drive mode, and never degrees
@@ -132,11 +131,9 @@ _FIELDS = tuple(field.name for field in fields(Motor) if field.name != "name")
 
 @dataclass(frozen=True)
 class MotorFile:
-    """A calibration file: where it is, its content, its motors by name in the file's order."""
-
     path: Path
     content: bytes
-    motors: Mapping[str, Motor]
+    motors: Mapping[str, Motor]  # by name, in the file's order
 
     def write(self, changed: Mapping[str, Motor]) -> Path:
         """Write some motors over the file, as LeRobot would; what it held is kept under the name that is given back."""
@@ -151,8 +148,7 @@ class MotorFile:
 
 
 def is_gripper(motor: str) -> bool:
-    """Whether a motor opens a gripper, whose numbers are 0 to 100; of two arms it is ``left_gripper``."""
-    return motor.endswith("gripper")
+    return motor.endswith("gripper")  # of two arms it is left_gripper; its numbers are 0 to 100
 
 
 def zero_shift_deg(one: Motor, two: Motor) -> float:
@@ -195,7 +191,6 @@ def read_motors(path: Path) -> MotorFile:
 
 
 def require_motors(file: MotorFile, motors: Sequence[str]) -> None:
-    """Raise InputError if a calibration file lacks one of the motors."""
     missing = [name for name in motors if name not in file.motors]
     if missing:
         text = f"found no motor {missing[0]}; it has {', '.join(file.motors)}."
@@ -203,7 +198,6 @@ def require_motors(file: MotorFile, motors: Sequence[str]) -> None:
 
 
 def read_json(path: Path, most: int, expected: str, hint: str) -> tuple[bytes, Any]:
-    """A file of at most so many bytes, and what it holds."""
     content = input_bytes(path, most, expected)
     try:
         return content, json.loads(text_of(content, path, hint))
@@ -289,13 +283,7 @@ def wiring_of(
 
 
 class Gripper:
-    """The tool of an arm: at nominal parameters, or at those of a calibration.
-
-    Attributes:
-        name: of the arm.
-        wiring: by commanded joint, base to tip, its motor and its sense.
-        ranges_deg: by motor, how far its joint goes by the model; infinite where that states no limits.
-    """
+    """The tool of an arm: at nominal parameters, or at those of a calibration."""
 
     def __init__(
         self, path: Path, arm: str | None, motors: Sequence[str], texts: Sequence[str], registry: PluginRegistry
@@ -313,9 +301,10 @@ class Gripper:
             raise ConfigError(f"found the arms {', '.join(system.arms)}.", where=where, hint=hint)
         self.name = arm or next(iter(system.arms))
         expression = arm_expression(system.arms[self.name], parameters, system.environment)
-        self.wiring = wiring_of(expression.joints, motors, texts)
+        self.wiring = wiring_of(expression.joints, motors, texts)  # by commanded joint, base to tip
         limits = joint_limits(system.arms[self.name].nominal_chain)
         ends = {motor: limits[joint] for joint, (motor, _) in self.wiring.items()}
+        # By motor, how far its joint goes by the model; infinite where that states no limits
         self.ranges_deg = {motor: math.degrees(e[1] - e[0]) if e else math.inf for motor, e in ends.items()}
         commands = ca.SX.sym("commands", len(self.wiring))
         full = ca.vertcat(commands, ca.DM(expression.defaults[len(self.wiring) :]))

@@ -13,7 +13,7 @@ from armcal.base.arrays import Array
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import write_over
 from armcal.measure.csv_writer import csv_text
-from armcal.measure.rests import StillSettings, rests
+from armcal.measure.rests import StillSettings, last_motions, rests
 from armcal.plugins import library
 
 from armcal_lerobot.motor_files import MotorFile, Units, is_gripper, read_json, require_motors, wiring_of
@@ -25,14 +25,13 @@ _MOST_FRAMES = 5_000_000  # 46 hours at 30 frames a second: they are in memory a
 _VERSIONS = ("v2.0", "v2.1", "v3.")
 _WHOLE = "Take it whole from where it was recorded."
 _MOST_PERCENT = 105.0
-_FEWEST = 10
-REVERSAL = 0.35  # deg or %: a command that comes back by less has not reversed; a servo's count is 0.09 deg
+_REVERSAL_DEG = 0.35  # A command that comes back by less has not reversed; a servo's count is 0.09 deg
 _RADIANS_MOVED = 0.5  # An arm whose joints all stay within pi, and that moves by so much: in degrees it hardly moves
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Frames of one episode without a gap: place in it (N), time (N, s), commands and states (N x motors; deg or %)."""
+    """Frames of one episode without a gap: place in it (N), time (N, s), commands and states (N x motors)."""
 
     episode: int
     frame: Array
@@ -48,18 +47,8 @@ class Recording:
     folder: Path  # with ``meta`` and ``data``
     version: str  # as stated, such as v2.1
     fps: float  # frames a second
-    motors: tuple[str, ...]  # in the order of the numbers
-    units: tuple[str, ...]  # of each motor's numbers: deg, or % (the gripper's, and all where degrees are not known)
+    motors: tuple[str, ...]  # in the order of the numbers, which are deg (the gripper's %)
     stretches: tuple[Stretch, ...]  # in order
-
-    @property
-    def motion(self) -> tuple[Stretch, ...]:
-        """All stretches of ten frames and more."""
-        stretches = tuple(stretch for stretch in self.stretches if len(stretch.frame) >= _FEWEST)
-        if not stretches:
-            text = f"found no {_FEWEST} frames in a row of one episode."
-            raise DataError(text, where=Location(str(self.folder)), hint="Record episodes without gaps.")
-        return stretches
 
     def video(self, camera: str, episode: int) -> tuple[Path, int]:
         """A camera's video of an episode, and the frame in it at which the episode begins."""
@@ -81,10 +70,9 @@ class Recording:
 
 
 def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | None = None) -> Recording:
-    """A data set whose numbers are in a unit (the gripper's always in percent).
-
-    With the follower's calibration file percent become degrees.
-    """
+    """A data set whose numbers are in a unit (the gripper's always in percent); the file is the follower's."""
+    if stored == "percent" and file is None:
+        raise InputError("found numbers in percent, expected degrees.", hint="Give --calibration FILE as well.")
     path = folder / "meta" / "info.json"
     where = Location(str(path))
     info = read_json(path, _MAX_META, "a LeRobot data set's meta/info.json", "Give the folder with meta and data.")[1]
@@ -109,9 +97,7 @@ def open_recording(folder: Path, stored: Units = "degrees", file: MotorFile | No
     if file is not None:
         require_motors(file, state)
         scale = np.array([1.0 if is_gripper(motor) else file.motors[motor].degrees_in(stored) for motor in state])
-    unit = "%" if stored == "percent" and file is None else "deg"
-    units = tuple("%" if is_gripper(motor) else unit for motor in state)
-    return Recording(folder, str(version), float(fps), state, units, tuple(_stretches(rows, scale)))
+    return Recording(folder, str(version), float(fps), state, tuple(_stretches(rows, scale)))
 
 
 def _motors(features: Any, feature: str, where: Location) -> tuple[str, ...]:
@@ -177,7 +163,6 @@ def _stretches(rows: Array, scale: Array) -> Iterator[Stretch]:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[Any]:
-    """A parquet file, opened; what the library raises of a damaged one is a DataError with the file."""
     parquet = library("pyarrow.parquet", "reading LeRobot's data sets")
     try:
         with parquet.ParquetFile(path, memory_map=True) as table:
@@ -187,20 +172,13 @@ def _parquet(path: Path) -> Iterator[Any]:
         raise DataError(f"it is damaged or cut off ({reason}).", where=Location(str(path)), hint=_WHOLE) from fault
 
 
-def sides(command: Array) -> tuple[Array, Array]:
-    """Which way a command moved last (N; -1, 1, or 0 before its first motion), and how far since it reversed."""
-    side, way = np.zeros(len(command)), np.zeros(len(command))
-    now, turned, extreme = 0.0, command[0], command[0]
-    for i, value in enumerate(command.tolist()):
-        if now == 0.0:
-            if abs(value - turned) > REVERSAL:
-                now, extreme = (1.0 if value > turned else -1.0), value
-        elif (value - extreme) * now > 0:
-            extreme = value
-        elif abs(value - extreme) > REVERSAL:
-            now, turned, extreme = -now, extreme, value
-        side[i], way[i] = now, abs(extreme - turned)
-    return side, way
+def is_copy(recording: Recording) -> bool:
+    """Whether states are the commands of the same frame, or of the one before."""
+    frames = [(s.commanded, s.reached) for s in recording.stretches if np.ptp(s.reached, axis=0).any()]
+    return bool(frames) and (
+        all(np.array_equal(command, state) for command, state in frames)
+        or all(np.array_equal(command[:-1], state[1:]) for command, state in frames)
+    )
 
 
 @dataclass(frozen=True)
@@ -219,14 +197,14 @@ class RestRecord:
 
 def records_of(recording: Recording, angles: str, window_s: float, spread_deg: float) -> list[RestRecord]:
     """All rests of all episodes, in order: ``angles`` are those of the ``state``, or those of the ``action``."""
-    if "deg" not in recording.units:
-        raise InputError("found numbers in percent, expected degrees.", hint="Give --calibration FILE as well.")
     turning = [not is_gripper(name) for name in recording.motors]
     still = StillSettings.si(window=window_s, spread=np.radians(spread_deg))
     records = []
     for stretch in recording.stretches:
         shown = (stretch.commanded if angles == "action" else stretch.reached)[:, turning]
-        approach = np.column_stack([sides(command)[0] for command in stretch.commanded[:, turning].T])
+        approach = np.column_stack(
+            [last_motions(command, _REVERSAL_DEG) for command in stretch.commanded[:, turning].T]
+        )
         for rest in rests(np.radians(shown.T), [], stretch.time, still):
             frame, mean = int(stretch.frame[(rest.start + rest.stop) // 2]), shown[rest.start : rest.stop].mean(axis=0)
             records.append(RestRecord(stretch.episode, frame, mean, approach[rest.stop - 1]))

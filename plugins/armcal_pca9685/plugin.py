@@ -5,8 +5,8 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_links(register: Register) -> None:
-    register("linux_i2c", "armcal_pca9685.linux_i2c:LinuxI2cLink", "an I2C bus of this computer")
-    register("framed", "armcal_pca9685.framed_link:FramedLink", "a board that looks after the arm by itself")
+    register("linux_i2c", "armcal_pca9685.links:LinuxI2cLink", "an I2C bus of this computer")
+    register("framed", "armcal_pca9685.links:FramedLink", "a board that looks after the arm by itself")
 
 
 @hookimpl

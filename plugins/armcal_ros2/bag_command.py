@@ -2,10 +2,9 @@
 
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import click
@@ -15,8 +14,21 @@ from armcal.cli.common import FILE, Console, speaking
 from armcal.errors import DataError
 from armcal.io.plain_files import refuse, require_new, write_new
 
-from armcal_ros2.bag import CAMERA_INFO, IMAGES, JOINT_STATE, Bag, Stamps, nanoseconds
-from armcal_ros2.reader import GUARD_S, MEASURED, TRANSFORMS, JointLog, JointRest, JointsSettings, RestSettings
+from armcal_ros2.reader import (
+    CAMERA_INFO,
+    GUARD_S,
+    IMAGES,
+    JOINT_STATE,
+    MEASURED,
+    TRANSFORMS,
+    Bag,
+    JointLog,
+    JointRest,
+    JointsSettings,
+    RestSettings,
+    Stamps,
+    nanoseconds,
+)
 
 _MOST_FRAMES = 200
 _LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once
@@ -24,18 +36,12 @@ _LATEST = 20  # So many stamps of joint states are kept: transforms that are com
 
 @dataclass
 class TopicSummary:
-    """A topic: its type, messages, and frames (of transforms ``a -> b``).
-
-    ``first`` and ``last`` are when its messages were received (s since 1970), of topics that calibrate.
-    ``computed`` counts transforms, by frame, with the very stamp of a joint state: robot_state_publisher's.
-    """
-
     type: str
-    first: float | None = None
+    first: float | None = None  # when its messages were received (s since 1970), of topics that calibrate
     last: float | None = None
     count: int = 0
-    frames: Counter[str] = field(default_factory=Counter)
-    computed: Counter[str] = field(default_factory=Counter)
+    frames: Counter[str] = field(default_factory=Counter)  # messages by frame, of transforms ``a -> b``
+    computed: Counter[str] = field(default_factory=Counter)  # with the very stamp of a joint state: not measured
 
     @property
     def measured(self) -> list[str]:
@@ -43,20 +49,13 @@ class TopicSummary:
 
 
 class Survey(NamedTuple):
-    """Topics by name, joint states by topic, and what is missing or wrong."""
-
     topics: dict[str, TopicSummary]
-    joints: dict[str, JointLog]
-    remarks: list[str]
+    joints: dict[str, JointLog]  # by topic
+    remarks: list[str]  # what is missing or wrong
 
 
 def survey(bag: Bag) -> Survey:
-    """Once through the recording.
-
-    Raises:
-        DataError: it is none, or holds no message.
-        PluginError: rosbags is not there.
-    """
+    """Once through the recording."""
     topics, joints, remarks = dict[str, TopicSummary](), dict[str, JointLog](), list[str]()
     stamps = deque[int](maxlen=_LATEST)
     for topic, received, _, message in bag.messages(lambda topic: topic.type in (JOINT_STATE, *MEASURED)):
@@ -191,8 +190,16 @@ def images(
         middle = (rests[place].begin + rests[place].end) / 2
         lines.append(",".join([name, *map(repr, [middle, *rests[place].means.tolist()])]))
     files = {table: ("\n".join(lines) + "\n").encode()}
-    if infos:
-        files[information] = _camera_info(infos[0]).encode()
+    for info in infos[:1]:
+        distortion = [float(x) for x in info.d]
+        camera = {
+            "image_width": int(info.width),
+            "image_height": int(info.height),
+            "camera_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in info.k]},
+            "distortion_model": info.distortion_model,
+            "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
+        }
+        files[information] = yaml.safe_dump(camera, sort_keys=False).encode()
     write_new(files)
     names = {f"q{i}_rad": f"{name}_rad" for i, name in enumerate(log.names, start=1)}
     is_named = not {f"{name}_rad" for name in log.names} <= names.keys()
@@ -245,8 +252,9 @@ def _nearest(
         yield held[0], held[2]
 
 
-_MAGIC: Mapping[bytes, str] = MappingProxyType({b"\xff\xd8": ".jpg", b"\x89PNG": ".png"})
-_LUMA: Mapping[str, float] = MappingProxyType({"r": 0.299, "g": 0.587, "b": 0.114, "y": 1.0, "_": 0.0})
+_MAGIC = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png"}
+_LUMA = {"r": 0.299, "g": 0.587, "b": 0.114, "y": 1.0, "_": 0.0}
+# The bytes of a pixel by encoding: red, green, blue, brightness, and what does not count
 _LAYOUTS = {
     "y": ("mono8", "8uc1"),
     "rgb": ("rgb8",),
@@ -256,16 +264,11 @@ _LAYOUTS = {
     "y_": ("yuv422_yuy2", "yuyv"),
     "_y": ("yuv422", "uyvy", "mono16", "16uc1"),
 }
-_ENCODINGS = MappingProxyType({name: layout for layout, names in _LAYOUTS.items() for name in names})
-"""The bytes of a pixel by encoding: red, green, blue, brightness, and what does not count."""
+_ENCODINGS = {name: layout for layout, names in _LAYOUTS.items() for name in names}
 
 
 def picture_of(message: Any, topic: str) -> tuple[str, bytes]:
-    """The ending of a file's name and its content: as compressed, or grey values as PGM.
-
-    Raises:
-        DataError: of an encoding that is not read.
-    """
+    """The ending of a file's name and its content: as compressed, or grey values as PGM."""
     data = np.asarray(message.data, dtype=np.uint8)
     if not hasattr(message, "encoding"):
         content = data.tobytes()
@@ -283,15 +286,3 @@ def picture_of(message: Any, topic: str) -> tuple[str, bytes]:
     weights = [_LUMA[part] for part in layout]
     grey = np.round(rows.reshape(message.height, message.width, len(layout)) @ weights).astype(np.uint8)
     return ".pgm", f"P5\n{message.width} {message.height}\n255\n".encode() + grey.tobytes()
-
-
-def _camera_info(message: Any) -> str:
-    distortion = [float(x) for x in message.d]
-    content = {
-        "image_width": int(message.width),
-        "image_height": int(message.height),
-        "camera_matrix": {"rows": 3, "cols": 3, "data": [float(x) for x in message.k]},
-        "distortion_model": message.distortion_model,
-        "distortion_coefficients": {"rows": 1, "cols": len(distortion), "data": distortion},
-    }
-    return yaml.safe_dump(content, sort_keys=False)

@@ -32,11 +32,6 @@ class Ros2NodeExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The file.
-
-        Raises:
-            ConfigError: no measurement gives positions or poses of the tip, or several do and none is named.
-        """
         s = self._settings
         own = {name: str(i.settings.get("type")) for name, i in request.instruments.items()}
         usable = {name: _CHANNELS[kind] for name, kind in own.items() if kind in _CHANNELS}

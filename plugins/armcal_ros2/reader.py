@@ -1,17 +1,18 @@
-"""The reader ``rosbag2``: records from a recording of ROS 2, one a rest of the arm."""
+"""Recordings of ROS 2 (folders or files), as ``rosbags`` reads them; and the reader ``rosbag2``: a record a rest."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import re
 from array import array
-from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, NoReturn
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from armcal.base.arrays import Array
@@ -21,11 +22,147 @@ from armcal.calibration.rigid_chain import nominal_tools
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
-from armcal.measure.rests import StillSettings, deviations_of_mean, judged, mean_pose, rests
+from armcal.measure.rests import StillSettings, deviations_of_mean, judged, last_motions, mean_pose, rests
+from armcal.plugins import library, said
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from armcal_ros2.bag import JOINT_STATE, Bag, Stamps, Topic, TopicSettings, nanoseconds
+JOINT_STATE = "sensor_msgs/msg/JointState"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_PURPOSE = "reading recordings of ROS 2"
+_MOST_DELAYS = 4096
+_ZERO, _SAME = "with the stamp zero", "with the stamp of the one before"
+_EARLIER = "with a stamp before that of an earlier one"
+# A larger part of the messages, and times are not to be trusted
+_MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01})
+Clock = Literal["header", "receive"]
+
+
+class Topic(NamedTuple):
+    name: str
+    type: str  # of its messages (``sensor_msgs/msg/JointState``)
+
+
+class TopicSettings(Settings):
+    """A topic, and what its times are: stamps of its headers, or when the recorder received its messages."""
+
+    topic: str | None = None
+    stamps: Clock = "header"
+
+
+class Stamps:
+    """Times of one topic's messages, in order; those that cannot be are counted."""
+
+    def __init__(self, topic: str, clock: Clock) -> None:
+        self.topic, self.count = topic, 0
+        self._latest: float | None = None  # the last time (s since 1970)
+        self._clock = clock
+        self.faults = Counter[str]()  # why messages are left out
+        self._delays = array("d")
+
+    def time(self, stamp: int, received: int) -> float | None:
+        """Seconds since 1970 (arguments in ns); None where it is missing, repeated or before an earlier one."""
+        self.count += 1
+        chosen = stamp if self._clock == "header" else received
+        time, latest = chosen / 1e9, self._latest
+        if not chosen or (latest is not None and time <= latest):
+            self.faults[_ZERO if not chosen else _SAME if time == latest else _EARLIER] += 1
+            return None
+        self._latest = time
+        if len(self._delays) < _MOST_DELAYS:
+            self._delays.append((received - chosen) / 1e9)
+        return time
+
+    @property
+    def delay(self) -> float:
+        """The median time from measurement to receipt, by both clocks (s); NaN before the first message."""
+        return float(np.median(self._delays)) if self._delays else float("nan")
+
+    def check(self, place: str) -> list[str]:
+        """What was left out, sentences; refused if stamps are zero, constant or backwards in too many messages."""
+        for cause, most in _MOST.items():
+            if (count := self.faults[cause]) > max(most * self.count, 1):
+                what = cause.removeprefix("with ")
+                text = f"{count} of {self.count} messages of {self.topic} have {what}, expected times of measurement."
+                hint = f"Set stamps: receive for {self.topic}, or give each program that publishes a topic of its own."
+                refuse(place, text, hint)
+        listed = ", ".join(f"{count} {cause}" for cause, count in self.faults.most_common())
+        return [f"of {self.count} messages of {self.topic} some were left out: {listed}."] if listed else []
+
+
+def nanoseconds(stamp: Any) -> int:
+    """The time of a header (ns since 1970)."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+_METADATA = "metadata.yaml"
+_KINDS = (".mcap", ".db3")
+_EXPECTED = "Give a recording of ROS 2: a folder with metadata.yaml, or a file .mcap or .db3."
+_RECOVER = (
+    "If its recorder was killed: mcap recover FILE.mcap -o NEW.mcap makes a whole file of what it wrote, ros2 bag "
+    "reindex FOLDER the metadata.yaml."
+)
+
+
+class Bag:
+    """A recording (folder or file); ``rosbags`` reads its messages from the files whenever they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics = Counter[Topic]()  # how many messages each has; complete once messages were asked for
+        self.remarks: list[str] = []  # what of it is missing or could not be read, sentences
+        self._files = [path]
+        if not path.exists():
+            refuse(path, "there is no such file or folder.", "Check the spelling and the directory.")
+        if not path.is_dir() and path.suffix not in _KINDS:
+            hint = "Convert it with rosbags-convert." if path.suffix == ".bag" else _EXPECTED
+            refuse(path, f"found the ending {path.suffix or 'none'}, expected .mcap or .db3.", hint)
+        for journal in path.glob("*.db3-wal"):
+            if journal.stat().st_size:
+                self._remark(
+                    f"{journal.name} holds messages that are not read: its recorder was killed. To have them, run "
+                    f"sqlite3 {journal.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'."
+                )
+        if path.is_dir() and not (path / _METADATA).exists():  # which names its files
+            files = [file for file in path.iterdir() if file.suffix in _KINDS]
+            if not files:
+                refuse(path, f"found no {_METADATA} and no file .mcap or .db3 in it.", _EXPECTED)
+            self._files = sorted(files, key=lambda file: [int(n) for n in re.findall(r"\d+", file.name)])
+            self._remark(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
+
+    def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[tuple[Topic, int, bytes, Any]]:
+        """The messages of chosen topics, of each file by their time: when they were received (ns since 1970), their
+        bytes, and what rosbags made of them.
+        """
+        rosbag2, typesys = (library(f"rosbags.{name}", _PURPOSE) for name in ("rosbag2", "typesys"))
+        types, unread = typesys.get_typestore(typesys.Stores.LATEST), Counter[Topic]()
+        self.topics.clear()
+        for file in self._files:
+            count = 0
+            try:
+                with rosbag2.Reader(file) as reader:
+                    topics = {one.id: Topic(one.topic, one.msgtype) for one in reader.connections}
+                    self.topics.update({topics[one.id]: one.msgcount for one in reader.connections})
+                    chosen = [one for one in reader.connections if is_read(topics[one.id])]
+                    for connection, received, data in reader.messages(chosen) if chosen else ():
+                        count += 1
+                        try:
+                            content = types.deserialize_cdr(data, connection.msgtype)
+                        except Exception:  # damaged bytes or a type that is not standard
+                            unread[topics[connection.id]] += 1
+                            continue
+                        yield topics[connection.id], received, bytes(data), content
+            except Exception as fault:  # of damaged files rosbags has no one error
+                text = f"it is cut off, damaged or no recording, after {count} messages ({said(fault)})."
+                refuse(file, text, f"{_EXPECTED} {_RECOVER}")
+        for topic, lost in unread.items():
+            self._remark(f"{lost} messages of {topic.name} ({topic.type}) could not be decoded: left out.")
+
+    def _remark(self, text: str) -> None:
+        if text not in self.remarks:
+            self.remarks.append(text)
+
 
 GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
 _THINNED_S = 0.01  # Joints are kept so far apart: 25 MB for an hour of seven of them
@@ -58,19 +195,19 @@ class RestSettings(Settings):
 
 @dataclass(frozen=True)
 class JointRest:
-    """A rest of the joints: begin and end (s), means and standard deviations by joint (rad or m)."""
+    """A rest of the joints: begin and end (s); by joint."""
 
     begin: float
     end: float
-    means: Array
-    scatter: Array
+    means: Array  # rad or m
+    scatter: Array  # standard deviations
+    approach: Array  # the sign of the last motion; 0 where there was none
 
 
 class JointLog:
-    """Joint states as they come: rests, and directions of motion.
+    """Joint states as they come, by their names in the recording; once it is closed, the rests among them.
 
-    ``names`` are those of the recording, and ``slides`` says which of these joints slide. ``rests`` are complete once
-    it is closed: also shorter ones than a rest's window, to be listed.
+    ``slides`` says which of these joints slide. Rests shorter than the window are there too, to be listed.
     """
 
     def __init__(
@@ -82,14 +219,10 @@ class JointLog:
         self._still = still
         self._places: dict[tuple[str, ...], list[int]] = {}
         self._times, self._rows = array("d"), array("d")
-        self._turned_at: list[tuple[float, Array]] = []
-        self._furthest: Array | None = None
-        self._direction = np.zeros(len(self.names))
         self._before: list[Array] = []  # where the joints were last, and where before that, apart
         self._returns = 0
         self._others = set[str]()
-        self._stated = settings.topic
-        self.topic = settings.topic  # if none was stated, the first that has joint states
+        self._stated = settings.topic  # if none is, the first that has joint states
         self.stamps = Stamps(settings.topic or "", settings.stamps)
         self.largest = np.zeros(len(self.names))  # absolute positions, by joint (rad or m), once it is closed
         self.rests: list[JointRest] = []
@@ -98,12 +231,10 @@ class JointLog:
         return topic.type == JOINT_STATE and self._stated in (None, topic.name)
 
     def add(self, topic: Topic, message: Any, received: int) -> None:
-        """The next message, a sensor_msgs/JointState."""
-        if self.topic is None:
-            self.topic = self.stamps.topic = topic.name
-        if topic.name != self.topic:
+        if topic.name != (self.stamps.topic or topic.name):
             self._others.add(topic.name)
             return
+        self.stamps.topic = topic.name
         names = tuple(message.name)
         if names not in self._places:
             self._places[names] = [names.index(name) for name in self.names if name in names]
@@ -118,21 +249,29 @@ class JointLog:
         if len(message.position) != len(names) or not (np.abs(row := message.position[places]) < _LARGEST).all():
             self.stamps.faults[_NO_POSITION] += 1
             return
-        self._take(time, row * self._scale)
+        row = row * self._scale
+        if self._before and (np.abs(row - self._before[0]) > _JUMP * self._limits).any():
+            self._returns += int((np.abs(row - self._before[-1]) <= self._limits).all())
+            self._before.insert(1, self._before[0])
+        self._before[:] = [row, *self._before[1:2]]
+        if not self._times or time - self._times[-1] >= _THINNED_S:
+            self._times.append(time)
+            self._rows.extend(row.tolist())
 
     def close(self, place: str) -> list[str]:
-        """The end of the recording: what was left out, sentences.
-
-        Raises:
-            DataError: nothing in it can be used.
-        """
+        """The end of the recording: what was left out, sentences; refused if nothing can be used."""
         times, rows = np.array(self._times), np.array(self._rows).reshape(-1, len(self.names)).T
         self.largest = np.abs(rows).max(axis=1, initial=0.0)
         still = StillSettings.si(window=self._still.window / 2, spread=1.0)
+        motions = np.array([last_motions(row, limit) for row, limit in zip(rows, self._limits, strict=True)])
         for rest in rests(rows / self._limits[:, None], (), times, still):
-            self.rests.append(self._rest(times[rest.start : rest.stop], rows[:, rest.start : rest.stop]))
-        topic, count, named = self.topic, self.stamps.count, set().union(*self._places)
-        if self._others or topic is None or not (named or count):
+            begin, end, joints = float(times[rest.start]), float(times[rest.stop - 1]), rows[:, rest]
+            settled = (times[rest] >= begin + self._still.settle) & (times[rest] <= end - GUARD_S)
+            joints = joints[:, settled] if settled.any() else joints
+            approach = motions[:, rest.stop - 1]
+            self.rests.append(JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1), approach))
+        topic, count, named = self.stamps.topic, self.stamps.count, set().union(*self._places)
+        if self._others or not topic or not (named or count):
             text = f"found {', '.join(sorted(filter(None, (topic, *self._others)))) or 'no topic'} with joint states"
             hint = "Set joints: {topic: NAME} in the data section; armcal bag info lists what is there."
             refuse(place, f"{text}, expected one.", hint)
@@ -155,36 +294,6 @@ class JointLog:
             text = f"{topic} is silent {silent.sum()} times, for up to {pauses[longest]:.1f} s"
             remarks.append(f"{text} (from {times[longest]:.2f}): a rest ends there.")
         return remarks
-
-    def approach(self, time: float) -> Array:
-        """The sign of each joint's last motion before a time; 0 where it has not moved."""
-        place = bisect_right(self._turned_at, time, key=lambda entry: entry[0])
-        return self._turned_at[place - 1][1] if place else np.zeros(len(self.names))
-
-    def _take(self, time: float, row: Array) -> None:
-        if self._before and (np.abs(row - self._before[0]) > _JUMP * self._limits).any():
-            self._returns += int((np.abs(row - self._before[-1]) <= self._limits).all())
-            self._before.insert(1, self._before[0])
-        self._before[:] = [row, *self._before[1:2]]
-        if not self._times or time - self._times[-1] >= _THINNED_S:
-            self._times.append(time)
-            self._rows.extend(row.tolist())
-        if self._furthest is None:
-            self._furthest = row
-        moved = row - self._furthest
-        beyond = np.abs(moved) > self._limits
-        if beyond.any():
-            self._furthest = np.where(beyond, row, self._furthest)
-            direction = np.where(beyond, np.sign(moved), self._direction)
-            if (direction != self._direction).any():
-                self._turned_at.append((time, direction))
-                self._direction = direction
-
-    def _rest(self, times: Array, rows: Array) -> JointRest:
-        begin, end = float(times[0]), float(times[-1])
-        settled = (times >= begin + self._still.settle) & (times <= end - GUARD_S)
-        joints = rows[:, settled] if settled.any() else rows
-        return JointRest(begin, end, joints.mean(axis=1), joints.std(axis=1))
 
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -224,39 +333,14 @@ class MeasuredSettings(TopicSettings):
         return self
 
 
-class _Tree:
-    """The newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)."""
-
-    def __init__(self) -> None:
-        self.edges: dict[str, tuple[str, Array, float | None]] = {}
-
-    def between(self, reference: str, frame: str) -> tuple[list[str], Array] | None:
-        """The frames on the way from one to another, and the pose of the latter in the former; None without a way."""
-        above, beside = self._above(frame), self._above(reference)
-        if above[-1] != beside[-1]:
-            return None
-        while above and beside and above[-1] == beside[-1]:  # what is above both does not matter
-            above.pop(), beside.pop()
-        return [*above, *beside], np.linalg.inv(self._pose(beside)) @ self._pose(above)
-
-    def _pose(self, names: Sequence[str]) -> Array:
-        return reduce(lambda pose, name: self.edges[name][1] @ pose, names, np.eye(4))
-
-    def _above(self, frame: str) -> list[str]:
-        names = [frame]
-        while names[-1] in self.edges and self.edges[names[-1]][0] not in names:
-            names.append(self.edges[names[-1]][0])
-        return names
-
-
 @dataclass(frozen=True)
 class _Seen:
-    """What a measurement saw in a rest: a mean pose (4 x 4), the deviation of its place (m), or why there is none."""
+    """What a measurement saw in a rest."""
 
-    pose: Array
-    deviation: float = float("nan")
+    pose: Array  # the mean (4 x 4)
+    deviation: float = math.nan  # of its place (m)
     samples: int = 0
-    fault: str = ""
+    fault: str = ""  # why there is none
 
 
 class MeasuredLog:
@@ -267,17 +351,16 @@ class MeasuredLog:
         self.stamps = Stamps(settings.topic, settings.stamps)
         self.types = tuple(_FIELDS) if settings.reference is None else (TRANSFORMS,)
         self._samples = array("d")  # 8 each: s, m, quaternion xyzw
-        self._tree = _Tree()
+        # the newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)
+        self._edges: dict[str, tuple[str, Array, float | None]] = {}
         self._frames = Counter[str]()
         self._moved_at: float | None = None
 
     def reads(self, topic: Topic) -> bool:
-        """Whether messages of a topic are for it: its own, and transforms that hold for good."""
         is_static = self.settings.reference is not None and topic.name.endswith(_STATIC)
         return topic.type in self.types and (topic.name == self.settings.topic or is_static)
 
     def add(self, topic: Topic, message: Any, received: int) -> None:
-        """The next message of a topic that it reads."""
         if topic.type == TRANSFORMS:
             self._follow(message, received, topic.name.endswith(_STATIC))
             return
@@ -288,22 +371,16 @@ class MeasuredLog:
         if time is None:
             return
         body, position, orientation = _FIELDS[topic.type]
-        held = getattr(message, body) if body else message
-        q = getattr(held, orientation) if orientation else None
-        p = getattr(held, position)
-        turn = None if q is None else np.array([q.x, q.y, q.z, q.w])
-        self._take(time, np.array([p.x, p.y, p.z]), turn)
+        content = getattr(message, body) if body else message
+        p, q = getattr(content, position), getattr(content, orientation) if orientation else None
+        self._take(time, np.array([p.x, p.y, p.z]), None if q is None else np.array([q.x, q.y, q.z, q.w]))
 
     def close(self, place: str) -> list[str]:
-        """What was left out, sentences.
-
-        Raises:
-            DataError: nothing was measured, or its frames are not those that were asked for.
-        """
+        """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for."""
         s, count = self.settings, self.stamps.count
         where = f"{place}, data.measurements.{self.instance}"
         if s.reference is not None and not count:
-            frames = ", ".join(sorted({*self._tree.edges, *(edge[0] for edge in self._tree.edges.values())}))
+            frames = ", ".join(sorted({*self._edges, *(edge[0] for edge in self._edges.values())}))
             text = f"found no way from the frame {s.reference} to {s.frame} in {s.topic}; its frames are"
             refuse(where, f"{text} {frames[:400] or 'none'}.", "Correct frame and reference.")
         listed = ", ".join(f"{name or 'none'} ({some})" for name, some in self._frames.most_common())
@@ -321,7 +398,6 @@ class MeasuredLog:
         return remarks
 
     def seen(self, rests: Sequence[JointRest], still: RestSettings) -> list[_Seen]:
-        """What it saw in each rest once the arm had settled."""
         samples, offset = np.array(self._samples).reshape(-1, 8), self.settings.clock_offset
         spans = np.array([(rest.begin + still.settle, rest.end - GUARD_S) for rest in rests]) + offset
         return [self._seen(samples[slice(*span)], still.drift) for span in np.searchsorted(samples[:, 0], spans)]
@@ -353,20 +429,33 @@ class MeasuredLog:
             pose, place, child = np.eye(4), part.transform.translation, part.child_frame_id.lstrip("/")
             pose[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
             pose[:3, 3] = (place.x, place.y, place.z)
-            self._tree.edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
+            self._edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
             changed.add(child)
-        way = self._tree.between((s.reference or "").lstrip("/"), (s.frame or "").lstrip("/"))
-        if way is None or changed.isdisjoint(way[0]):
+        above, beside = self._above(s.frame or ""), self._above(s.reference or "")
+        between = {*above} ^ {*beside}  # what is above both does not matter
+        if above[-1] != beside[-1] or changed.isdisjoint(between):
             return
         # where several frames move, the oldest says when all of the pose was seen
-        times = (self._tree.edges[name][2] for name in way[0])
+        times = (self._edges[name][2] for name in between)
         oldest = min((at for at in times if at is not None), default=None)
         if oldest is None or oldest == self._moved_at:
             return
         self._moved_at = oldest
         time = self.stamps.time(round(oldest * 1e9), received)
         if time is not None:
-            self._take(time, way[1][:3, 3], Rotation.from_matrix(way[1][:3, :3]).as_quat())
+            in_root, reference = (
+                reduce(lambda pose, name: self._edges[name][1] @ pose, names[:-1], np.eye(4))
+                for names in (above, beside)
+            )
+            pose = np.linalg.inv(reference) @ in_root
+            self._take(time, pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat())
+
+    def _above(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on to the root."""
+        names = [frame.lstrip("/")]
+        while names[-1] in self._edges and self._edges[names[-1]][0] not in names:
+            names.append(self._edges[names[-1]][0])
+        return names
 
     def _take(self, time: float, position: Array, turn: Array | None) -> None:
         if not np.isfinite(position).all():
@@ -432,12 +521,7 @@ class Rosbag2Reader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """The means of all rests that were measured, in SI; the other rests are set aside with their reasons.
-
-        Raises:
-            DataError: there is no such recording, topic, frame or joint, or no rest that was measured.
-            PluginError: rosbags is not there.
-        """
+        """The means of all rests that were measured, in SI; the other rests are set aside with their reasons."""
         s, bag, digest = self._settings, Bag(self._settings.path), hashlib.sha256()
         unknown = sorted(set(s.measurements) - set(request.measurements))
         have = ", ".join(request.measurements) or "none"
@@ -458,9 +542,12 @@ class Rosbag2Reader:
                     log.add(topic, content, received)
         remarks = joints.close(str(s.path))
         rests = joints.rests
-        self._refuse_degrees(
-            request, channels, np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest
-        )
+        turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
+        largest = np.abs([rest.means for rest in rests]).max(axis=0) if rests else joints.largest
+        for name, position in zip(channels, largest, strict=True):
+            if name in turning and position > _FULL_TURN:
+                hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
+                self._refuse(f"{name} stands at {position:.6g} rad, more than one turn (2 pi rad).", hint)
         if not rests:
             hint = "Let the arm stand at each pose, or give a wider spread_deg or a shorter window_s under still."
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
@@ -491,7 +578,6 @@ class Rosbag2Reader:
         return channels
 
     def _require(self, log: MeasuredLog, types: Mapping[str, str]) -> None:
-        """Refuse a topic that is not there, or whose messages (types by topic) measure nothing."""
         topic = log.settings.topic
         if types.get(topic) in log.types:
             return
@@ -506,10 +592,9 @@ class Rosbag2Reader:
     def _dataset(
         self, request: ReadRequest, names: list[str], joints: JointLog, logs: Sequence[MeasuredLog], remarks: list[str]
     ) -> Dataset:
-        """A record a rest."""
         rests, still, place = joints.rests, self._settings.still, str(self._settings.path)
         means = np.array([rest.means for rest in rests]).T
-        sides = np.array([joints.approach(rest.end) for rest in rests]).T
+        sides = np.array([rest.approach for rest in rests]).T
         channels = dict(zip(names, means, strict=True))
         channels |= {name.replace(".", ".approach.", 1): own for name, own in zip(names, sides, strict=True)}
         channels["time"] = np.array([(rest.begin + rest.end) / 2 for rest in rests])
@@ -519,7 +604,14 @@ class Rosbag2Reader:
         for log in logs:
             name, own = log.instance, seen[log.instance]
             channels |= self._measured(name, request, own)
-            self._refuse_inverted(request, name, channels, own)
+            arm = request.measurements[name].arms[0]
+            angles = np.array([channels[f"{arm}.{joint}"] for joint in request.arms[arm].commanded]).T
+            if is_inverted(nominal_tools(request.arms[arm], angles), np.array([one.pose for one in own])):
+                text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm"
+                mend = f"Set inverted: {str(not log.settings.inverted).lower()} for {name}."
+                self._refuse(
+                    f"{text} does.", mend if log.settings.reference is None else "Exchange frame and reference."
+                )
             remarks += self._clock_remarks(log, joints, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)
@@ -541,18 +633,6 @@ class Rosbag2Reader:
         rows = tuple(range(1, len(rests) + 1))
         return Dataset(ids, channels, extra, rows, place, warnings=warnings).without(faulty)
 
-    def _refuse_inverted(
-        self, request: ReadRequest, name: str, channels: Mapping[str, Array], seen: Sequence[_Seen]
-    ) -> None:
-        """Refuse poses whose inverses move as the nominal tools do."""
-        own = request.measurements[name].arms[0]
-        joints = np.array([channels[f"{own}.{joint}"] for joint in request.arms[own].commanded]).T
-        if is_inverted(nominal_tools(request.arms[own], joints), np.array([one.pose for one in seen])):
-            settings = self._settings.measurements[name]
-            mend = f"Set inverted: {str(not settings.inverted).lower()} for {name}."
-            text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm does"
-            self._refuse(f"{text}.", mend if settings.reference is None else "Exchange frame and reference.")
-
     def _clock_remarks(self, log: MeasuredLog, joints: JointLog, seen: Sequence[_Seen]) -> list[str]:
         """By the times of receipt the clocks differ, or a point moves while the joints rest, as if they did."""
         apart = joints.stamps.delay - log.stamps.delay
@@ -567,11 +647,7 @@ class Rosbag2Reader:
         return [f"{text}, set clock_offset_s: {apart:.3f} for {log.instance}."]
 
     def _measured(self, name: str, request: ReadRequest, seen: Sequence[_Seen]) -> dict[str, Array]:
-        """The channels of a measurement, NaN where it saw nothing.
-
-        Raises:
-            DataError: it reads what no pose has, or orientations of points.
-        """
+        """The channels of a measurement, NaN where it saw nothing."""
         poses = np.array([one.pose for one in seen])
         turned = np.isfinite(poses[:, 0, 0])
         values = {axis: poses[:, i, 3] for i, axis in enumerate("xyz")}
@@ -588,14 +664,6 @@ class Rosbag2Reader:
             topic = self._settings.measurements[name].topic
             self._refuse(f"{name} reads orientations, and {topic} has points.", "Set type: tip_position.")
         return {f"{name}.{own}": values[own] for own in needed}
-
-    def _refuse_degrees(self, request: ReadRequest, names: Iterable[str], positions: Array) -> None:
-        """Angles beyond one turn of joints that do not turn on and on."""
-        turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
-        for name, largest in zip(names, positions, strict=True):
-            if name in turning and largest > _FULL_TURN:
-                hint = "If these are degrees, set joints: {unit: deg}; if not, record angles within one turn."
-                self._refuse(f"{name} stands at {largest:.6g} rad, more than one turn (2 pi rad).", hint)
 
     def _refuse(self, message: str, hint: str) -> NoReturn:
         refuse(self._settings.path, message, hint)

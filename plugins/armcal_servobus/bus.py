@@ -1,35 +1,184 @@
-"""A bus of servos on a serial port: instructions and answers, time-outs, repeats, what went wrong on the way; and who
-is there: two servos with one id are seen by how they answer together.
+"""A bus of servos on a serial port: what servos have in their registers, by model, from the makers' tables [FeetechSTS]
+[Dynamixel2]; instructions and answers, time-outs, repeats, what went wrong on the way; and who is there: two servos
+with one id are seen by how they answer together.
 """
 
+import csv
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
-from functools import cache
+from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
+from typing import Annotated, Literal, NamedTuple
 
+from armcal.arm.servo import teeth_text
 from armcal.base.settings import Duration
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
 from pydantic import Field
 
-from armcal_servobus.models import MAPS, ProtocolName, RegisterMap, Stretch, model_of
+ProtocolName = Literal["feetech", "dynamixel2"]
+COUNTS = 4096  # Of a turn; the encoder goes on from the last one to zero
+STEP = 2 * math.pi / COUNTS  # rad
 
-BROADCAST = 0xFE
-LAST_ID = 0xFC
-"""The highest that both protocols know; Feetech's has 253 too, which armcal keeps free to listen for echoes."""
 
-_STATUS = b"\x55"
+@dataclass(frozen=True)
+class Register:
+    """Where a number stands (low byte first), and how it is written."""
+
+    address: int  # of its first byte
+    size: int = 1  # bytes
+    sign_bit: int | None = None  # its sign stands apart, in this bit; None: there is none, or it is a two's complement
+    is_signed: bool = False  # it is a two's complement
+    unit: float = 1.0  # what one count is, in SI
+
+    def pack(self, value: int) -> bytes:
+        bits = self.sign_bit if self.sign_bit is not None else 8 * self.size - self.is_signed
+        most = (1 << bits) - 1
+        least = -most if self.sign_bit is not None else -(most + 1) if self.is_signed else 0
+        if not least <= value <= most:
+            raise ValueError(f"found {value}, expected {least} to {most}")
+        if self.sign_bit is not None and value < 0:
+            value = -value | 1 << self.sign_bit
+        return value.to_bytes(self.size, "little", signed=self.is_signed)
+
+    def unpack(self, data: bytes) -> int:
+        value = int.from_bytes(data, "little", signed=self.is_signed)
+        if self.sign_bit is None:
+            return value
+        magnitude = value & ((1 << self.sign_bit) - 1)
+        return -magnitude if value >> self.sign_bit & 1 else magnitude
+
+
+Stretch = tuple[int, int]  # Registers that follow each other: the address of the first one, and how many bytes
+
+
+@dataclass(frozen=True)
+class RegisterMap:
+    """What all servos of a protocol have in common."""
+
+    registers: Mapping[str, Register]  # by armcal's name of what they hold; those that servos lack are not there
+    polled: tuple[Stretch, ...]  # what changes while they work
+    stored: Stretch  # what their EEPROM keeps without power
+    alarms: Mapping[int, str]  # words, by the bit of the alarm
+    position_mode: int  # what the register of the operating mode holds while they go to positions
+    offset_limit: int  # the largest magnitude of the homing offset
+    offset_sign: int  # of the offset in the position that they report: -1 if that is the encoder's less the offset
+
+    def numbers(self, stretch: Stretch, data: bytes) -> dict[str, int]:
+        """What a stretch of registers holds, by name."""
+        first, count = stretch
+        there = {name: r for name, r in self.registers.items() if first <= r.address <= first + count - r.size}
+        return {name: r.unpack(data[r.address - first : r.address - first + r.size]) for name, r in there.items()}
+
+    def words(self, alarm: int) -> tuple[str, ...]:
+        named = tuple(text for bit, text in self.alarms.items() if alarm & bit)
+        unknown = alarm & ~sum(self.alarms)
+        return (*named, f"alarm 0x{unknown:02x}") if unknown else named
+
+
+class ServoModel(NamedTuple):
+    name: str  # as configurations have it
+    protocol: ProtocolName  # that it speaks
+    number: int | None  # as its register has it; None: of all that are alike
+    teeth: int = 0  # of the spline on which its horn sits; 0: not known
+    knows_load: bool = True  # whether its register of load has a share of its full torque, and not a current
+
+    @property
+    def map(self) -> RegisterMap:
+        return MAPS[self.protocol]
+
+    def check_offset(self, offset: int) -> None:
+        """Raise ValueError if a servo cannot hold a homing offset; it says what to do."""
+        limit = self.map.offset_limit
+        if (beyond := abs(offset) - limit) <= 0:
+            return
+        amount = f"its horn by {math.degrees(beyond * STEP):.0f} deg or more"
+        if self.teeth:
+            tooth = COUNTS / self.teeth
+            amount = "it by " + teeth_text(math.ceil(beyond / tooth), math.degrees(tooth * STEP))
+        raise ValueError(
+            f"found an offset of {offset} counts, expected -{limit} to {limit}, which is all that a {self.name} holds: "
+            f"remount {amount}"
+        )
+
+
+def _registers(protocol: ProtocolName) -> dict[str, Register]:
+    """Those of ``registers.csv``; its units are in SI (V, rad/s, rad/s^2, shares of full torque)."""
+    registers = {}
+    with Path(__file__).with_name("registers.csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            if row["protocol"] == protocol:
+                bit = int(row["sign"].removeprefix("bit ")) if row["sign"].startswith("bit") else None
+                place = int(row["address"]), int(row["bytes"])
+                registers[row["name"]] = Register(*place, bit, row["sign"] == "complement", float(row["unit"]))
+    return registers
+
+
+_ALARMS = {0x01: "voltage", 0x02: "angle sensor", 0x04: "overheating", 0x20: "overload"}
+MAPS: Mapping[ProtocolName, RegisterMap] = MappingProxyType(
+    {
+        "feetech": RegisterMap(
+            _registers("feetech"),
+            polled=((40, 27),),
+            stored=(9, 25),
+            alarms=_ALARMS | {0x08: "overcurrent"},
+            position_mode=0,
+            offset_limit=2047,
+            offset_sign=-1,
+        ),
+        "dynamixel2": RegisterMap(
+            _registers("dynamixel2"),
+            polled=((64, 7), (116, 31)),
+            stored=(11, 45),
+            alarms=_ALARMS | {0x08: "encoder", 0x10: "shock"},
+            position_mode=3,
+            offset_limit=1024,
+            offset_sign=1,
+        ),
+    }
+)
+_BY_LOAD = {"xl430-w250": 1060, "xc430-w150": 1070, "xc430-w240": 1080, "mx28-2": 30}
+_BY_CURRENT = {
+    **{"xl330-m077": 1190, "xl330-m288": 1200, "xc330-t181": 1210, "xc330-t288": 1220, "xc330-m181": 1230},
+    **{"xc330-m288": 1240, "xm430-w350": 1020, "xm430-w210": 1030, "xm540-w270": 1120, "xm540-w150": 1130},
+    **{"mx64-2": 311, "mx106-2": 321},
+}
+_ALL = (
+    ServoModel("sts3215", "feetech", 777, teeth=25),
+    ServoModel("sts3250", "feetech", 2825),
+    ServoModel("sm8512bl", "feetech", 11272),
+    ServoModel("sts", "feetech", None),
+    *(ServoModel(name, "dynamixel2", number) for name, number in _BY_LOAD.items()),
+    *(ServoModel(name, "dynamixel2", number, knows_load=False) for name, number in _BY_CURRENT.items()),
+)
+MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _ALL})
+# Those that servos can be set to, the likeliest first
+BAUD_RATES: Mapping[ProtocolName, tuple[int, ...]] = MappingProxyType(
+    {
+        "feetech": (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400),
+        "dynamixel2": (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600),
+    }
+)
+
+
+LAST_ID = 0xFC  # Both protocols know it; Feetech's has 253 too, which armcal keeps free to listen for echoes
+SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
+_BROADCAST, _ECHO_ID = 0xFE, 0xFD  # Nobody has the second: what comes back when it is asked is an echo
 _LONGEST = 1024
+_BITS = 10  # On the line, of a byte
+_NOISE = 4  # So many bytes that mean nothing are more than an adapter makes that turns its direction
+_FIRST_IDS = range(31)  # Asked one by one where nothing else is said; beyond that only those that answer to all
+_BROADCAST_S, _ONE_S = 0.25, 0.03
+_AGAIN = 4  # So often a servo is read: two with one id do not always collide. So many damaged answers are no chance.
 
 
 class Instruction(IntEnum):
-    """What a servo is asked to do."""
-
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
@@ -37,18 +186,16 @@ class Instruction(IntEnum):
     SYNC_WRITE = 0x83
 
 
-@dataclass(frozen=True)
-class Status:
+class Status(NamedTuple):
     """A servo's answer."""
 
-    id: int  # of the servo
+    id: int
     alarm: int  # the bits by which it says that it is unwell; of protocol 2 only that it is
     refusal: str  # why it did not do what it was asked, in words; empty if it did
     data: bytes  # what was read
 
 
-@dataclass(frozen=True)
-class Received:
+class Received(NamedTuple):
     """What a stretch of bytes holds."""
 
     answers: tuple[Status, ...]  # those that are whole and right, in order
@@ -58,7 +205,7 @@ class Received:
 
 @dataclass(frozen=True)
 class Framing:
-    """The packets of a protocol: header, id, length of what follows, content, check."""
+    """Packets of a protocol: header, id, length of what follows, content, check."""
 
     header: bytes
     size: int  # bytes of an address, of a count, of the length and of the check
@@ -77,7 +224,6 @@ class Framing:
         return b"".join(number.to_bytes(self.size, "little") for number in numbers)
 
     def encoded(self, servo: int, instruction: Instruction, parameters: bytes = b"") -> bytes:
-        """A whole instruction."""
         content = bytes((instruction,)) + parameters
         if self.stuffed:
             content = content.replace(self.stuffed, self.stuffed + self.stuffed[-1:])
@@ -105,19 +251,16 @@ class Framing:
                 continue
             content = packet[start - at :]
             if content.startswith(self.prefix):
-                answers.append(self._status(packet[head], content[len(self.prefix) :]))
+                alarm, held, refusal = content[len(self.prefix)], content[len(self.prefix) + 1 :], ""
+                if self.refusals:
+                    code, alarm = alarm & 0x7F, alarm & 0x80
+                    refusal = self.refusals.get(code, f"error {code}") if code else ""
+                    held = held.replace(self.stuffed + self.stuffed[-1:], self.stuffed)
+                answers.append(Status(packet[head], alarm, refusal, held))
             at = done = end
         begun = (self.header[:count] for count in range(head - 1, 0, -1))
         rest = next((part for part in begun if data[done:].endswith(part)), b"")
         return Received(tuple(answers), damaged, rest)
-
-    def _status(self, servo: int, content: bytes) -> Status:
-        error, data = content[0], content[1:]
-        if not self.refusals:
-            return Status(servo, error, "", data)
-        code = error & 0x7F
-        refusal = self.refusals.get(code, f"error {code}") if code else ""
-        return Status(servo, error & 0x80, refusal, data.replace(self.stuffed + self.stuffed[-1:], self.stuffed))
 
 
 def _inverted_sum(packet: bytes) -> bytes:
@@ -128,16 +271,11 @@ def _crc16(packet: bytes) -> bytes:
     """CRC-16 of polynomial 0x8005, from zero, not reflected. [Dynamixel2]"""
     crc = 0
     for value in packet:
-        crc = ((crc << 8) & 0xFFFF) ^ _crc_of((crc >> 8) ^ value)
+        crc ^= value << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
+        crc &= 0xFFFF
     return crc.to_bytes(2, "little")
-
-
-@cache
-def _crc_of(byte: int) -> int:
-    crc = byte << 8
-    for _ in range(8):
-        crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
-    return crc & 0xFFFF
 
 
 _DAMAGED = "the instruction arrived damaged"  # After this refusal the same instruction may be sent again
@@ -155,16 +293,9 @@ _REFUSALS2 = MappingProxyType(
 FRAMINGS: Mapping[ProtocolName, Framing] = MappingProxyType(
     {
         "feetech": Framing(b"\xff\xff", 1, _inverted_sum),
-        "dynamixel2": Framing(b"\xff\xff\xfd\0", 2, _crc16, _STATUS, b"\xff\xff\xfd", _REFUSALS2),
+        "dynamixel2": Framing(b"\xff\xff\xfd\0", 2, _crc16, b"\x55", b"\xff\xff\xfd", _REFUSALS2),
     }
 )
-
-
-_BITS = 10  # On the line, of a byte
-_ECHO_ID = 0xFD  # Nobody's: what comes back when it is asked is an echo
-_NOBODY = frozenset((-1,))
-_NOISE = 4  # So many bytes that mean nothing are more than an adapter makes that turns its direction
-SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
 
 
 class BusSettings(SerialPortSettings):
@@ -183,13 +314,13 @@ class BusSettings(SerialPortSettings):
 class Bus:
     """One bus. Each call is bounded in time: three tries take 0.4 s at most with the settings that it has by itself.
 
-    Attributes:
-        counts: ``damaged`` and ``extra``: how often answers were so.
+    Calls raise DeviceLostError where a servo does not answer, DeviceError where it refuses or its answers are damaged.
     """
 
     def __init__(self, settings: BusSettings, names: Mapping[int, str] | None = None) -> None:
         self.settings = settings
-        self.counts: Counter[str] = Counter()
+        self.where = Location(str(settings.port))
+        self.counts: Counter[str] = Counter()  # how often answers were ``damaged``, or ``extra``
         self.map: RegisterMap = MAPS[settings.protocol]
         self._names = names or {}
         self._framing = FRAMINGS[settings.protocol]
@@ -197,17 +328,8 @@ class Bus:
         self._port = SerialPort(settings)
         self._echoes, self._is_clean = False, True
 
-    @property
-    def where(self) -> Location:
-        return Location(str(self.settings.port))
-
     def open(self) -> str:
-        """Open its port, and find out whether the adapter sends back what is sent; gives its serial number.
-
-        Raises:
-            DeviceRefusedError: there is no such port, it is taken, or does not know the baud rate.
-            DeviceLostError: it was open before, and is gone.
-        """
+        """Open its port, and find out whether the adapter sends back what is sent; gives its serial number."""
         try:
             number = self._port.open()
         except ValueError as fault:
@@ -225,27 +347,16 @@ class Bus:
         self._port.close()
 
     def probe(self, servo: int, reply_s: float) -> Received:
-        """Ping an id once, or all with ``BROADCAST``, and take whatever comes in this time."""
-        received = self._exchange(self._framing.encoded(servo, Instruction.PING), _NOBODY, None, reply_s)
+        """Ping an id once, or all of them, and take whatever comes in this time."""
+        received = self._exchange(self._framing.encoded(servo, Instruction.PING), frozenset((-1,)), None, reply_s)
         self._is_clean = True  # all of that time was waited for
         return received
 
     def read(self, servo: int, address: int, count: int) -> bytes:
-        """Bytes of a servo's registers.
-
-        Raises:
-            DeviceLostError: it does not answer.
-            DeviceError: it refuses, or all its answers are damaged.
-        """
         return self._ask(servo, Instruction.READ, self._framing.numbers(address, count), count).data
 
     def write(self, servo: int, address: int, data: bytes) -> None:
-        """Write to a servo's registers; one that does not acknowledge it is read back.
-
-        Raises:
-            DeviceLostError: it does not answer.
-            DeviceError: it refuses, or holds another value.
-        """
+        """Write to a servo's registers; one that does not acknowledge it is read back."""
         try:
             self._ask(servo, Instruction.WRITE, self._framing.numbers(address) + data, 0)
         except DeviceLostError:
@@ -263,7 +374,7 @@ class Bus:
         data: dict[int, bytes] = {}
         place = self._framing.numbers(address, count)
         for attempt in range(self.settings.tries if len(missing) > 1 else 0):
-            packet = self._framing.encoded(BROADCAST, Instruction.SYNC_READ, place + bytes(missing))
+            packet = self._framing.encoded(_BROADCAST, Instruction.SYNC_READ, place + bytes(missing))
             wait = self._wait(len(packet) + len(missing) * (count + self._framing.overhead), attempt)
             answers = self._exchange(packet, frozenset(missing), count, wait).answers
             data |= {answer.id: answer.data for answer in answers if len(answer.data) == count}
@@ -278,23 +389,21 @@ class Bus:
             return
         listed = b"".join(bytes((servo,)) + value for servo, value in data.items())
         place = self._framing.numbers(address, len(next(iter(data.values()))))
-        packet = self._framing.encoded(BROADCAST, Instruction.SYNC_WRITE, place + listed)
+        packet = self._framing.encoded(_BROADCAST, Instruction.SYNC_WRITE, place + listed)
         self._send(packet)
         if self._echoes:
             self._is_clean = self._heard(self.settings.reply, len(packet)) == packet
 
     def number(self, servo: int, name: str) -> int:
-        """What a servo's register holds; see ``read``."""
         register = self.map.registers[name]
         return register.unpack(self.read(servo, register.address, register.size))
 
     def set_number(self, servo: int, name: str, value: int) -> None:
-        """See ``write``."""
         register = self.map.registers[name]
         self.write(servo, register.address, register.pack(value))
 
     def numbers(self, servos: Iterable[int], *stretches: Stretch) -> dict[int, dict[str, int]]:
-        """What stretches of registers hold, by id and name; see ``read``."""
+        """What stretches of registers hold, by id and name."""
         numbers: dict[int, dict[str, int]] = {servo: {} for servo in servos}
         for stretch in stretches:
             for servo, data in self.read_all(numbers, *stretch).items():
@@ -302,7 +411,7 @@ class Bus:
         return numbers
 
     def alarms(self, servo: int) -> tuple[str, ...]:
-        """What a servo's last answer says that is wrong with it, in words; see ``read``."""
+        """What a servo's last answer says that is wrong with it, in words."""
         alarm = self._alarms.get(servo, 0)
         if alarm and "status" in self.map.registers:  # there its answers say only that there is something
             alarm = self.number(servo, "status")
@@ -312,7 +421,6 @@ class Bus:
         return f"{self._names[servo]} (id {servo})" if servo in self._names else f"the servo with id {servo}"
 
     def _ask(self, servo: int, instruction: Instruction, parameters: bytes, count: int) -> Status:
-        """An answer of so many bytes, after as many tries as are allowed."""
         packet = self._framing.encoded(servo, instruction, parameters)
         was_damaged = 0
         for attempt in range(self.settings.tries):
@@ -351,13 +459,9 @@ class Bus:
         return heard
 
     def _exchange(self, packet: bytes, servos: frozenset[int], count: int | None, wait_s: float) -> Received:
-        """Send a packet, and take answers until those of all servos are there or time is up.
+        """Send a packet, and take answers of so many bytes (None: any) until all servos have answered, or time is up.
 
-        Args:
-            packet: an echo of it is taken away.
-            servos: whose answers; where it is one, a damaged one ends the waiting.
-            count: how many bytes an answer to this packet has, if it is no refusal; None: any.
-            wait_s: at most.
+        An echo is taken away. Where one servo is asked, a damaged answer ends the waiting.
         """
         self._send(packet)
         answers: list[Status] = []
@@ -390,13 +494,6 @@ def _fits(answer: Status, count: int | None) -> bool:
     return bool(answer.refusal) or count is None or len(answer.data) == count
 
 
-_FIRST_IDS = range(31)
-"""Asked one by one where nothing else is said; beyond that only those that answer to all."""
-_BROADCAST_S = 0.25
-_ONE_S = 0.03
-_AGAIN = 4  # So often a servo is read: two with one id do not always collide. So many damaged answers are no chance.
-
-
 @dataclass(frozen=True)
 class FoundServo:
     """A servo that answers, as it was read without writing anything to it."""
@@ -410,10 +507,7 @@ class FoundServo:
     temperature_C: int | None = None
     alarms: tuple[str, ...] = ()  # in words
     damaged: int = 0  # so many of its answers were damaged, or followed by another one
-
-    @property
-    def is_doubled(self) -> bool:
-        return self.damaged >= _AGAIN
+    doubled: bool = False  # so many that two servos have its id
 
 
 def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
@@ -422,7 +516,7 @@ def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
     Feetech servos that are asked all at once may talk all at once: what they say then is only a hint. Where any
     answers, those that are silent are asked once more: a packet is lost now and then.
     """
-    hints = {answer.id for answer in bus.probe(BROADCAST, _BROADCAST_S).answers}
+    hints = {answer.id for answer in bus.probe(_BROADCAST, _BROADCAST_S).answers}
     silent, there = sorted({*ids, *hints}), list[int]()
     for _ in range(2):
         for servo in silent:
@@ -440,25 +534,23 @@ def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
 def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo | None:
     """What a servo says of itself; None: nothing. It is read several times, for two with one id do not answer alike."""
     before = bus.counts["damaged"] + bus.counts["extra"]
-    numbers: dict[str, int] = {}
+    names, numbers = ("model", "firmware", "position", "voltage", "temperature"), dict[str, int]()
     for _ in range(times):
-        try:
-            names = ("model", "firmware", "position", "voltage", "temperature")
+        with suppress(DeviceError):
             numbers = {name: bus.number(servo, name) for name in names}
-        except DeviceError:
-            continue
     damaged = bus.counts["damaged"] + bus.counts["extra"] - before
     if not numbers:
-        return FoundServo(servo, 0, None, damaged=damaged) if damaged else None
-    firmware = numbers["firmware"]
+        return FoundServo(servo, 0, None, damaged=damaged, doubled=damaged >= _AGAIN) if damaged else None
+    firmware, protocol = numbers["firmware"], bus.settings.protocol
     return FoundServo(
         servo,
         numbers["model"],
-        model_of(bus.settings.protocol, numbers["model"]),
-        f"{firmware & 0xFF}.{firmware >> 8}" if bus.settings.protocol == "feetech" else str(firmware),
+        next((m.name for m in MODELS.values() if (m.protocol, m.number) == (protocol, numbers["model"])), None),
+        f"{firmware & 0xFF}.{firmware >> 8}" if protocol == "feetech" else str(firmware),
         position=numbers["position"],
         voltage_V=round(numbers["voltage"] * bus.map.registers["voltage"].unit, 3),
         temperature_C=numbers["temperature"],
         alarms=bus.alarms(servo),
         damaged=damaged,
+        doubled=damaged >= _AGAIN,
     )

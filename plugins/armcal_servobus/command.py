@@ -5,9 +5,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import click
 from armcal.cli.common import FILE, Console, overrides, speaking
@@ -17,10 +17,9 @@ from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
-from armcal_servobus.bus import LAST_ID, Bus, BusSettings, FoundServo, looked_at, present
+from armcal_servobus.bus import BAUD_RATES, COUNTS, LAST_ID, STEP, Bus, BusSettings, ProtocolName, looked_at, present
 from armcal_servobus.device import ServoBusSettings, ServoStreamSettings
-from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos, check_offset
-from armcal_servobus.models import BAUD_RATES, COUNTS, STEP, ProtocolName
+from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos
 
 _SECTION = "bench"
 _KINDS: Mapping[str, type[ServoJointsSettings]] = {"device": ServoBusSettings, "joints": ServoStreamSettings}
@@ -45,9 +44,32 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
 
     Their baud rates, ids, models, and what they report. Nothing is written to them.
     """
-    protocols = (protocol,) if protocol else get_args(ProtocolName)
-    spoken, servos = _searched(console, port, protocols, baud, range(last_id + 1))
-    results = [{"baud": rate, **asdict(servo), "doubled": servo.is_doubled} for rate, servo in servos]
+    protocols: tuple[ProtocolName, ...] = (protocol,) if protocol else get_args(ProtocolName)
+    rates = [(spoken, rate) for spoken in protocols for rate in baud or BAUD_RATES[spoken]]
+    there: dict[ProtocolName, list[dict[str, Any]]] = {}
+    with console.progress() as show:
+        for place, (spoken, rate) in enumerate(rates):
+            if any(row["model"] for other in there if other != spoken for row in there[other]):
+                break  # servos of known models answer in another protocol
+            show("looking for servos", place / len(rates))
+            console.detail(f"{spoken} at {rate} baud")
+            wires = Bus(BusSettings.model_validate({"port": port, "protocol": spoken, "baud": rate}))
+            try:
+                wires.open()
+                servos = [looked_at(wires, servo) for servo in present(wires, range(last_id + 1))]
+            except DeviceRefusedError as refusal:
+                if isinstance(refusal.__cause__, ValueError):  # a baud rate that the port lacks
+                    continue
+                raise
+            finally:
+                wires.close()
+            if results := [{"baud": rate, **asdict(one)} for one in servos if one]:
+                there[spoken] = [*there.get(spoken, []), *results]
+    if not there:
+        text = f"no servo answers at {'these baud rates' if baud else 'any baud rate'}, ids 0 to {last_id}."
+        hint = "Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id."
+        raise InputError(text, where=Location(port), hint=hint)
+    spoken, results = max(there.items(), key=lambda item: any(row["model"] for row in item[1]))
     console.result({"port": port, "protocol": spoken, "servos": results})
     rows = []
     for row in results:
@@ -59,38 +81,6 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
     console.table(f"{port}, {spoken}", headings, rows, left=("state",))
     for number in sorted({row["id"] for row in results if row["doubled"]}):
         console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
-
-
-def _searched(
-    console: Console, port: str, protocols: Sequence[ProtocolName], bauds: Sequence[int], ids: Sequence[int]
-) -> tuple[ProtocolName, list[tuple[int, FoundServo]]]:
-    """The first protocol in which servos of known models answer, else in which any do; they, with their baud rates."""
-    rates = [(protocol, baud) for protocol in protocols for baud in bauds or BAUD_RATES[protocol]]
-    there: dict[ProtocolName, list[tuple[int, FoundServo]]] = {}
-    with console.progress() as show:
-        for place, (protocol, baud) in enumerate(rates):
-            if any(servo.model for spoken in there if spoken != protocol for _, servo in there[spoken]):
-                break
-            show("looking for servos", place / len(rates))
-            console.detail(f"{protocol} at {baud} baud")
-            wires = Bus(BusSettings.model_validate({"port": port, "protocol": protocol, "baud": baud}))
-            try:
-                wires.open()
-                looked = (looked_at(wires, servo) for servo in present(wires, ids))
-                servos = [(baud, servo) for servo in looked if servo is not None]
-            except DeviceRefusedError as refusal:
-                if isinstance(refusal.__cause__, ValueError):  # a baud rate that the port lacks
-                    continue
-                raise
-            finally:
-                wires.close()
-            if servos:
-                there.setdefault(protocol, []).extend(servos)
-    if not there:
-        text = f"no servo answers at {'these baud rates' if bauds else 'any baud rate'}, ids 0 to {ids[-1]}."
-        hint = "Switch the servos' power on and look at the plug of the first one; ids beyond that: --last-id."
-        raise InputError(text, where=Location(port), hint=hint)
-    return max(there.items(), key=lambda item: any(servo.model for _, servo in item[1]))
 
 
 def _on_config(command: Any) -> Any:
@@ -128,25 +118,21 @@ def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
     with _opened(config, overrides) as (servos, _):
         mistakes, joints, stored = servos.examine(), servos.joints, servos.stored
         servos.joints = {name: joints[name] for name in stored}
-        readings = servos.readings()
-        alarms = {name: list(servos.bus.alarms(joint.id)) for name, joint in servos.joints.items()}
-    rows: list[dict[str, Any]] = []
-    for name, reading in readings.items():
-        there, volts = stored[name], reading["voltage"] * servos.bus.map.registers["voltage"].unit
-        rows.append(
+        rows: list[dict[str, Any]] = [
             {
                 "joint": name,
                 "id": joints[name].id,
                 "angle_deg": round(math.degrees(servos.angle(name, reading)), 2),
                 "count": reading["position"],
-                "offset": there["offset"],
-                "limits": [there["min"], there["max"]],
-                "voltage_V": round(volts, 2),
+                "offset": stored[name]["offset"],
+                "limits": [stored[name]["min"], stored[name]["max"]],
+                "voltage_V": round(reading["voltage"] * servos.bus.map.registers["voltage"].unit, 2),
                 "temperature_C": reading["temperature"],
                 "torque": bool(reading["torque"]),
-                "alarms": alarms[name],
+                "alarms": list(servos.bus.alarms(joints[name].id)),
             }
-        )
+            for name, reading in servos.readings().items()
+        ]
     across = [name for name, joint in joints.items() if joint.crosses_seam]
     named = [{"joint": mistake.joint, "what": mistake.what, "mend": mistake.mend} for mistake in mistakes]
     console.result({"joints": rows, "mistakes": named, "ranges_over_the_seam": across})
@@ -165,51 +151,40 @@ def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
         sys.exit(EXIT_BAD_INPUT)
 
 
-@dataclass(frozen=True)
-class Homing:
-    """What is to become of a joint's homing offset."""
+class Homing(NamedTuple):
+    """What is to become of a joint's homing offset; positions as the servo reports them, all in counts."""
 
     joint: ServoJoint
-    position: int  # what it reports now (counts)
-    before: int  # the offset now (counts)
+    position: int  # now
+    before: int  # the offset now
     after: int
-
-    @property
-    def moved(self) -> int:
-        """By how many counts more it will report."""
-        return self.joint.model.map.offset_sign * (self.after - self.before)
-
-    @property
-    def change_deg(self) -> float:
-        """By how much the joint's angle is read otherwise afterwards."""
-        return math.degrees(self.joint.settings.direction * _nearest(self.moved) * STEP)
+    target: int  # the position by the new offset
+    change_deg: float  # by how much the joint's angle is read otherwise afterwards
 
 
 def planned(
     servos: Servos, angles: Mapping[str, float], zeros: Mapping[str, float], offsets: Mapping[str, int]
 ) -> list[Homing]:
-    """Offsets by which the joints' servos report what is stated; joints that are not named stand at zero.
+    """Offsets by which servos report that their joints stand at angles (rad; 0 where none is stated).
 
-    Args:
-        servos: of the joints that are to be changed.
-        angles: where joints stand (rad).
-        zeros: by how much joints stand beyond what they report (rad).
-        offsets: the offsets themselves (counts).
+    Or ``zeros`` beyond what they report now (rad), or the ``offsets`` themselves (counts).
     """
     readings, bus = servos.readings(), servos.bus
     if holding := [name for name, reading in readings.items() if reading["torque"]]:
         hint = "Hold the arm, and let its servos go with --release."
         raise InputError(f"{', '.join(holding)} hold, expected servos without torque.", where=bus.where, hint=hint)
-    plans, mends = [], []
+    plans, mends, sign = [], [], bus.map.offset_sign
     for name, joint in servos.joints.items():
         before, position = bus.number(joint.id, "offset"), readings[name]["position"]
         moved = round(joint.exact_count(angles.get(name, 0.0))) - position
         if name in zeros and name not in angles:
             moved = round(joint.settings.direction * zeros[name] / STEP)
-        after = offsets.get(name, _nearest(before + bus.map.offset_sign * moved))
-        plans.append(Homing(joint, position, before, after))
+        after = offsets.get(name, _nearest(before + sign * moved))
+        moved = sign * (after - before)
+        change_deg = math.degrees(joint.settings.direction * _nearest(moved) * STEP)
+        plans.append(Homing(joint, position, before, after, (position + moved) % COUNTS, change_deg))
         try:
-            check_offset(joint.model, after)
+            joint.model.check_offset(after)
         except ValueError as fault:
             mends.append(f"{name}: {fault}")
     if mends:
@@ -218,8 +193,8 @@ def planned(
 
 
 def write_offset(bus: Bus, plan: Homing) -> None:
-    """Write a homing offset to a servo's EEPROM, and read it back."""
-    servo, target = plan.joint.id, (plan.position + plan.moved) % COUNTS
+    """To the servo's EEPROM, read back."""
+    servo, target = plan.joint.id, plan.target
     written = [("offset", plan.after)]
     if bus.settings.protocol == "feetech":
         if (phase := bus.number(servo, "phase")) & SEVERAL_TURNS:
@@ -266,9 +241,17 @@ def home(
     Afterwards the servos report the angles at which you hold the arm, or those that a calibration found: of the joints
     that are named, or of all. The differences are shown first, and how to take them back.
     """
+    from armcal.calibration.calibration import zeros_of
+
     with _opened(config, overrides) as (servos, checks):
         degrees, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
-        zeros = {} if calibration is None else _zeros(console, calibration, arm_name, servos.joints)
+        zeros: dict[str, float] = {}  # rad
+        if calibration is not None:
+            computed, reasons = zeros_of(calibration, arm_name, console.registry())
+            for name, reason in reasons.items():
+                console.warn(f"{name} keeps its zero: {reason}.")
+            by_local = {name: name.rpartition(".")[2] for name in servos.joints}
+            zeros = {n: math.radians(computed[local].degrees) for n, local in by_local.items() if local in computed}
         for name in (*degrees, *counts):
             if name not in servos.joints:
                 listed = ", ".join(servos.joints)
@@ -295,17 +278,6 @@ def home(
     console.line("the offsets are written and read back.")
     if calibration is not None:
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
-
-
-def _zeros(console: Console, calibration: Path, arm: str | None, joints: Mapping[str, ServoJoint]) -> dict[str, float]:
-    """The zeros (rad) that a calibration found, by joint; the joints without one are named."""
-    from armcal.calibration.calibration import zeros_of
-
-    zeros, reasons = zeros_of(calibration, arm, console.registry())
-    for name, reason in reasons.items():
-        console.warn(f"{name} keeps its zero: {reason}.")
-    by_local = {name: name.rpartition(".")[2] for name in joints}
-    return {name: math.radians(zeros[local].degrees) for name, local in by_local.items() if local in zeros}
 
 
 def _numbers(stated: Sequence[str], number: Callable[[str], Number], example: str) -> dict[str, Number]:

@@ -42,6 +42,7 @@ _MENDS: Mapping[str, str] = {
     "encoder": "Its encoder is damaged: exchange the servo.",
     "shock": "Its supply failed or its wiring is damaged: look at both, then switch its power off and on.",
 }
+_FASTEST = 32767  # As the registers have it
 _SETTLES_S = 0.02
 _AGAIN_S = 0.5
 
@@ -79,6 +80,8 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
         self._clock: Clock = RealClock()
         self._is_open = False
         self._powered: set[str] = set()
+        self._goals: dict[str, int] = {}  # counts by joint, as last commanded
+        self._speeds: dict[str, int] = {}  # as the registers have them
         self._loaded_since: dict[str, float] = {}
         self._reported: set[tuple[str, str]] = set()
 
@@ -131,7 +134,8 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     @override
     def energise(self, joint: str, angle: float) -> None:
         """Hold the joint where it stands, then turn it to the angle at the speed that is set: it does not jump."""
-        servos, servo = self._opened(), self._joints[joint]
+        self._opened()
+        servo = self._joints[joint]
         goal = servo.count(angle)
         if joint not in self._powered:
             self._limit_motion(joint)
@@ -139,31 +143,30 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
             low, high = servo.count_range
             if not low <= here <= high:
                 servo.count(servo.angle(here))  # refuses what is further out than a count
-            servos.hold(joint, min(max(here, low), high))
+            here = min(max(here, low), high)
+            for register, value in (("goal", here), ("torque", 1), ("goal", here)):
+                self._bus.set_number(servo.id, register, value)  # some set their goal anew when torque comes on
+            self._goals[joint] = here
             self._powered.add(joint)
-        servos.command({joint: goal})
+        self._write_goals({joint: goal})
         self._clock.sleep(_SETTLES_S)
 
     @override
     def command(self, angles: Mapping[str, float]) -> None:
-        servos = self._opened()
+        self._opened()
         goals = {joint: self._joints[joint].count(angle) for joint, angle in angles.items()}
         require_energised(goals, self._powered, self._bus.where)
-        servos.command(goals)
+        self._write_goals(goals)
 
     @override
     def keep_alive(self) -> None:
-        """Read all servos, and send once more what did not arrive.
-
-        Raises:
-            DeviceUnwellError: one is too hot, or blocked; once for each.
-            DeviceError: one reports an alarm, or has not its voltage.
-            DeviceResetError: one has lost its torque.
-        """
-        servos = self._opened()
-        readings = servos.readings()
+        """Read all servos, judge them, and send once more the goals that did not arrive."""
+        readings = self._opened().readings()
         self._check(readings)
-        servos.repeat(readings, self._powered)
+        for joint, goal in self._goals.items():
+            if joint in self._powered and readings[joint]["goal"] != goal:
+                address = self._bus.map.registers["goal"].address
+                self._bus.write(self._joints[joint].id, address, self._goal_bytes(joint))
 
     @override
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
@@ -174,6 +177,7 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     def release(self, joint: str) -> None:
         servos = self._opened()
         self._powered.discard(joint)
+        self._goals.pop(joint, None)
         servos.release(joint)
 
     @override
@@ -182,7 +186,6 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
         self._bus.close()
 
     def _check(self, readings: Mapping[str, Mapping[str, int]]) -> None:
-        """Judge readings of this moment; see ``keep_alive``."""
         settings, registers, now = self._settings, self._bus.map.registers, self._clock.now()
         volt = registers["voltage"].unit
         for name, reading in readings.items():
@@ -214,8 +217,30 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
             raise DeviceUnwellError(f"{joint.label} {what}.", hint=_MENDS[fault])
 
     def _limit_motion(self, joint: str) -> None:
-        limits = self._settings.speed_deg_per_s, self._settings.acceleration_deg_per_s2
-        self._servos.set_motion(joint, *map(math.radians, limits))
+        """Limit how fast a servo turns by itself. Zero would be no limit, so it is never written."""
+        limits = self._settings.acceleration_deg_per_s2, self._settings.speed_deg_per_s
+        for key, limit in zip(("acceleration", "speed"), limits, strict=True):
+            register = self._bus.map.registers[key]
+            most = 254 if register.size == 1 else _FASTEST
+            number = min(max(round(math.radians(limit) / register.unit), 1), most)
+            self._bus.set_number(self._joints[joint].id, key, number)
+        self._speeds[joint] = number
+
+    def _write_goals(self, goals: Mapping[str, int]) -> None:
+        """All at once: nobody acknowledges that, and ``keep_alive`` repeats what did not arrive."""
+        self._goals |= goals
+        written = {self._joints[joint].id: self._goal_bytes(joint) for joint in goals}
+        self._bus.write_all(self._bus.map.registers["goal"].address, written)
+
+    def _goal_bytes(self, joint: str) -> bytes:
+        """A goal, and the speed in the same go where its register follows.
+
+        A servo that started anew has forgotten its speed, and some switch their torque on with the next goal. Zero
+        between the two is a time to be taken of some servos: the speed holds.
+        """
+        goal, speed = (self._bus.map.registers[register] for register in ("goal", "speed"))
+        data, between = goal.pack(self._goals[joint]), speed.address - goal.address - goal.size
+        return data + bytes(between) + speed.pack(self._speeds[joint]) if between >= 0 else data
 
     def _opened(self) -> Servos:
         if not self._is_open:

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Literal, NamedTuple
 
-from armcal.arm.servo import teeth_text
 from armcal.base.settings import Settings, UnitOf
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.errors import Location
 from pydantic import Field, field_validator, model_validator
 
-from armcal_servobus.bus import LAST_ID, SILENT_MEND, Bus, BusSettings, looked_at, present
-from armcal_servobus.models import COUNTS, MODELS, STEP, ServoModel
+from armcal_servobus.bus import COUNTS, LAST_ID, MODELS, SILENT_MEND, STEP, Bus, BusSettings, looked_at, present
 
 SEVERAL_TURNS = 0x10  # Of a Feetech servo's phase: it reports angles of several turns
 _SLACK = 1e-9
-_READ_TWICE = 2
 _ROUNDED = 2  # Counts: limits in a servo may be so much narrower than a range that was rounded
-_FASTEST = 32767  # As the registers have it, in which zero is no limit
 
 
 class BusJointSettings(Settings):
@@ -52,7 +46,7 @@ class BusJointSettings(Settings):
         if self.range[1] - self.range[0] > 2 * math.pi + STEP:
             raise ValueError("the range is wider than a turn, and an encoder knows no more: narrow it")
         if self.offset is not None:
-            check_offset(MODELS[self.model], self.offset)
+            MODELS[self.model].check_offset(self.offset)
         return self
 
 
@@ -88,7 +82,6 @@ class ServoJointsSettings(BusSettings):
         return chosen
 
 
-@dataclass(frozen=True)
 class ServoJoint:
     """A joint and its servo.
 
@@ -96,43 +89,21 @@ class ServoJoint:
     means the angle that is nearest to the middle of the joint's range.
     """
 
-    name: str
-    settings: BusJointSettings
-
-    @property
-    def id(self) -> int:
-        return self.settings.id
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} (id {self.id})"
-
-    @property
-    def model(self) -> ServoModel:
-        return MODELS[self.settings.model]
-
-    @cached_property
-    def count_range(self) -> tuple[int, int]:
-        """The lowest and the highest count of its range; beyond 0 or the last one where the range crosses the seam.
-
-        One count beyond is none: a range of the whole turn, -180 to 180 deg, ends where it begins.
-        """
-        ends = sorted(map(self.exact_count, self.settings.range))
+    def __init__(self, name: str, settings: BusJointSettings) -> None:
+        self.name, self.settings = name, settings
+        self.id, self.model = settings.id, MODELS[settings.model]
+        self.label = f"{name} (id {self.id})"
+        ends = sorted(map(self.exact_count, settings.range))
         low, high = math.ceil(ends[0] - _SLACK), math.floor(ends[1] + _SLACK)
-        return (0 if low == -1 else low), (COUNTS - 1 if high == COUNTS else high)
-
-    @property
-    def crosses_seam(self) -> bool:
-        """Whether the last count is followed by zero inside its range: it can be read there, and not be driven."""
-        low, high = self.count_range
-        return low < 0 or high >= COUNTS
+        # One count beyond the turn is none: a range of the whole turn, -180 to 180 deg, ends where it begins
+        self.count_range = (0 if low == -1 else low), (COUNTS - 1 if high == COUNTS else high)
+        # The last count is followed by zero inside its range: it can be read there, and not be driven
+        self.crosses_seam = self.count_range[0] < 0 or self.count_range[1] >= COUNTS
 
     def angle(self, count: float) -> float:
-        """Of a count (rad), as it stands."""
         return self.settings.direction * STEP * (count - self.settings.zero_count)
 
     def exact_count(self, angle: float) -> float:
-        """Of an angle (rad), not rounded; ``angle`` turned round."""
         return self.settings.zero_count + self.settings.direction * angle / STEP
 
     def unwrapped(self, count: int) -> int:
@@ -150,22 +121,7 @@ class ServoJoint:
         return min(max(count, self.count_range[0]), self.count_range[1])
 
 
-def check_offset(model: ServoModel, offset: int) -> None:
-    """Raise ValueError if a servo cannot hold a homing offset; it says what to do."""
-    limit = model.map.offset_limit
-    if (beyond := abs(offset) - limit) <= 0:
-        return
-    amount = f"its horn by {math.degrees(beyond * STEP):.0f} deg or more"
-    if model.teeth:
-        tooth = COUNTS / model.teeth
-        amount = "it by " + teeth_text(math.ceil(beyond / tooth), math.degrees(tooth * STEP))
-    raise ValueError(
-        f"found an offset of {offset} counts, expected -{limit} to {limit}, which is all that a {model.name} holds: "
-        f"remount {amount}"
-    )
-
-
-def drivable(joints: Collection[ServoJoint]) -> None:
+def drivable(joints: Iterable[ServoJoint]) -> None:
     """Raise ValueError if a joint's range crosses the end of its encoder's turn, over which no servo can be driven."""
     for joint in joints:
         if joint.crosses_seam:
@@ -178,39 +134,24 @@ def drivable(joints: Collection[ServoJoint]) -> None:
 
 
 class Mistake(NamedTuple):
-    """Something about a servo that is not as configured, and what to do. ``of_motion``: only one that moves minds."""
+    """Something about a servo that is not as configured."""
 
     joint: str
     what: str
-    mend: str
-    of_motion: bool = False
+    mend: str  # what to do
+    of_motion: bool = False  # it matters only if joints are to move
 
 
 class Servos:
-    """The servos of joints on their bus; each call is an exchange or two for all of them.
-
-    Attributes:
-        joints: by name.
-        stored: what servos keep without power, by joint and register; of those that were as configured in ``examine``.
-    """
+    """The servos of joints on their bus, by the joints' names."""
 
     def __init__(self, settings: ServoJointsSettings, names: Iterable[str]) -> None:
         self.joints = settings.chosen(names)
         self.bus = Bus(settings, {joint.id: name for name, joint in self.joints.items()})
-        self.stored: dict[str, dict[str, int]] = {}
-        self._goals: dict[str, int] = {}
-        self._speeds: dict[str, int] = {}
+        self.stored: dict[str, dict[str, int]] = {}  # what those that ``examine`` recognised keep without power
 
     def open(self, *, moves: bool = True) -> str:
-        """Open the bus; gives the adapter's serial number where all is as configured.
-
-        Args:
-            moves: whether joints are to move.
-
-        Raises:
-            DeviceLostError: no servo answers at all.
-            DeviceRefusedError: something is not as configured; every fault is named.
-        """
+        """Open the bus; gives the adapter's serial number where all is as configured, else names every fault."""
         try:
             adapter = self.bus.open()
             mistakes = [mistake for mistake in self.examine() if moves or not mistake.of_motion]
@@ -226,7 +167,7 @@ class Servos:
     def examine(self) -> list[Mistake]:
         """Read what the servos store; gives all that is not as configured."""
         bus, joints = self.bus, self.joints
-        servos = {name: looked_at(bus, joint.id, _READ_TWICE) for name, joint in joints.items()}
+        servos = {name: looked_at(bus, joint.id, times=2) for name, joint in joints.items()}
         ids = {joint.id for joint in joints.values()}
         strangers = [servo for servo in present(bus) if servo not in ids] if None in servos.values() else []
         if not strangers and not any(servos.values()):
@@ -238,7 +179,7 @@ class Servos:
                 listed = ", ".join(map(str, strangers))
                 mend = f"Found the id {listed}, which no joint has: is that the servo? Then give it the id {joint.id}."
                 mistakes.append(Mistake(joint.label, "does not answer", mend if strangers else SILENT_MEND))
-            elif servo.is_doubled:
+            elif servo.doubled:
                 what = f"answers damaged or twice ({servo.damaged} times)"
                 mend = f"Two servos may have the id {joint.id}: unplug all but one, and give it another id."
                 mistakes.append(Mistake(joint.label, what, mend))
@@ -252,63 +193,22 @@ class Servos:
         return mistakes
 
     def readings(self) -> dict[str, dict[str, int]]:
-        """What changes while servos work, by joint and register, as it stands there."""
+        """What changes while servos work, by joint and register."""
         by_id = self.bus.numbers([joint.id for joint in self.joints.values()], *self.bus.map.polled)
         return dict(zip(self.joints, by_id.values(), strict=True))
 
     def angle(self, name: str, reading: Mapping[str, int]) -> float:
-        """Where a joint stands (rad) by a reading."""
+        """Where a joint stands (rad)."""
         joint = self.joints[name]
         return joint.angle(joint.unwrapped(reading["position"]))
 
-    def set_motion(self, name: str, speed: float, acceleration: float) -> None:
-        """How fast a servo turns by itself at most (rad/s, rad/s^2). Zero would be no limit, so it is never written."""
-        for key, value in (("acceleration", acceleration), ("speed", speed)):
-            register = self.bus.map.registers[key]
-            most = 254 if register.size == 1 else _FASTEST
-            number = min(max(round(value / register.unit), 1), most)
-            self.bus.set_number(self.joints[name].id, key, number)
-        self._speeds[name] = number
-
-    def hold(self, name: str, count: int) -> None:
-        """Torque on, at a count that is where it stands."""
-        servo = self.joints[name].id
-        self.bus.set_number(servo, "goal", count)
-        self.bus.set_number(servo, "torque", 1)
-        self.bus.set_number(servo, "goal", count)  # some servos set their goal anew when torque comes on
-        self._goals[name] = count
-
     def release(self, name: str) -> None:
         """Torque off, read back."""
-        self._goals.pop(name, None)
         joint = self.joints[name]
         self.bus.set_number(joint.id, "torque", 0)
         if self.bus.number(joint.id, "torque"):
             text = f"the torque of {joint.label} did not go off."
             raise DeviceError(text, where=self.bus.where, hint="Hold the arm and switch the servos' power off.")
-
-    def command(self, goals: Mapping[str, int]) -> None:
-        """Goals of joints whose motion was set, all at once."""
-        self._goals |= goals
-        written = {self.joints[name].id: self._goal_bytes(name) for name in goals}
-        self.bus.write_all(self.bus.map.registers["goal"].address, written)
-
-    def repeat(self, readings: Mapping[str, Mapping[str, int]], powered: Collection[str]) -> None:
-        """Command once more what did not arrive: a goal for all at once is acknowledged by nobody."""
-        for name, goal in self._goals.items():
-            if name in powered and readings[name]["goal"] != goal:
-                address = self.bus.map.registers["goal"].address
-                self.bus.write(self.joints[name].id, address, self._goal_bytes(name))
-
-    def _goal_bytes(self, name: str) -> bytes:
-        """A goal, and the speed in the same go where its register follows.
-
-        A servo that started anew has forgotten its speed, and some switch their torque on with the next goal. Zero
-        between the two is a time to be taken of some servos: the speed holds.
-        """
-        goal, speed = (self.bus.map.registers[register] for register in ("goal", "speed"))
-        data, between = goal.pack(self._goals[name]), speed.address - goal.address - goal.size
-        return data + bytes(between) + speed.pack(self._speeds[name]) if between >= 0 else data
 
 
 def _mistakes(joint: ServoJoint, stored: Mapping[str, int]) -> list[Mistake]:

@@ -13,7 +13,7 @@ import pytest
 from armcal.calibration.exporter import random_commands, request_of, rigid_tools
 from armcal.errors import InputError, ProblemError
 from armcal_export import mujoco_model
-from armcal_export.content import content_of
+from armcal_export.description import content_of
 from armcal_export.mujoco_model import Hinge, LoadedModel, MujocoExporter, MujocoSettings, mjcf
 
 from tests.made_calibrations import following_arm, made_calibration
@@ -153,7 +153,7 @@ def test_names_of_a_urdf_stay_names_in_the_model():
 
 def test_without_mujoco_the_export_is_refused_with_the_way_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"pip install armcal\[mujoco\]"):
+    with pytest.raises(InputError, match=r"pip install 'armcal\[mujoco\]'"):
         exported(LRM)
 
 

@@ -10,7 +10,7 @@ from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedErr
 from armcal.devices.framed import VERSION, Frame, FrameDecoder, Kind, encoded
 from armcal.devices.link import GuardedLink
 from armcal_pca9685.device import Pca9685Device
-from armcal_pca9685.framed_link import FramedLink
+from armcal_pca9685.links import FramedLink
 from board_bench import JOINTS, PtyBoard, servo_file, written
 
 from tests.simulated_lines.pca9685_model import ADDRESS_ONLY

@@ -11,7 +11,7 @@ import pytest
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
 from armcal.errors import PluginError
 from armcal_pca9685.device import Pca9685Device
-from armcal_pca9685.linux_i2c import LinuxI2cLink
+from armcal_pca9685.links import LinuxI2cLink
 from board_bench import JOINTS, Clock, ModelLink, servo_file, written
 
 

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import armcal_pca9685.chip
 import armcal_pca9685.device
 import pytest
 from armcal.arm.servo import PulseClock
 from armcal.config.servo_file import CalibratedServo
 from armcal.devices.device import DeviceError
-from armcal_pca9685.chip import Channel, Chip, channel_register
-from armcal_pca9685.device import Pca9685Device
+from armcal_pca9685.device import Channel, Chip, Pca9685Device, channel_register
 from board_bench import JOINTS, LRM_PULSES_US, Clock, ModelLink, servo_file, written
 
 OSCILLATORS = (24.1e6, 26.9e6)

@@ -239,3 +239,16 @@ def _spreads(joints: Array, stops: Indices) -> Array:
         spreads[:, first] = np.maximum(high[:, first], high[:, last]) - np.minimum(low[:, first], low[:, last])
         low, high = np.minimum(low[:, :-width], low[:, width:]), np.maximum(high[:, :-width], high[:, width:])
     return spreads
+
+
+def last_motions(values: Array, least: float) -> Array:
+    """Which way values (N) moved last: 1, -1, or 0 before they first moved by ``least``; less is no reversal either."""
+    motions = np.zeros(len(values))
+    side, extreme = 0.0, next(iter(values.tolist()), 0.0)
+    for i, value in enumerate(values.tolist()):
+        if (value - extreme) * side > 0:
+            extreme = value
+        elif abs(value - extreme) > least:
+            side, extreme = (1.0 if value > extreme else -1.0), value
+        motions[i] = side
+    return motions

@@ -1,10 +1,9 @@
-"""LeRobot data sets and calibration files of arms whose faults are known."""
+"""LeRobot data sets and calibration files."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,6 @@ import numpy as np
 MOTORS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 FPS = 30
 COUNT_DEG = 360 / 4095
-
-
-@dataclass(frozen=True)
-class Planted:
-    """How a follower's motor follows: deg, s."""
-
-    offset: float = 0.0
-    gain: float = 1.0
-    backlash: float = 0.0
-    delay: float = 0.1
 
 
 def command(random: np.random.Generator, count: int, span: float) -> np.ndarray:
@@ -38,30 +27,14 @@ def command(random: np.random.Generator, count: int, span: float) -> np.ndarray:
     return values[:count] + tremor
 
 
-def follow(commanded: np.ndarray, planted: Planted, random: np.random.Generator) -> np.ndarray:
-    """The states that a command (N) leads to, by the encoder's counts."""
-    at = np.arange(len(commanded)) - planted.delay * FPS
-    late = np.interp(at, np.arange(len(commanded)), commanded)
-    half, played = planted.backlash / 2, np.empty(len(late))
-    now = late[0]
-    for i, value in enumerate(late):
-        now = min(max(now, value - half), value + half)
-        played[i] = now
-    state = planted.offset + planted.gain * played + random.normal(0, 0.05, len(late))
-    return np.round(state / COUNT_DEG) * COUNT_DEG
-
-
-def episodes(
-    planted: Mapping[str, Planted], count: int = 8, frames: int = 900, seed: int = 1, span: float = 80.0
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def episodes(count: int, frames: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Actions and states (N x motors each) of episodes."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     made = []
     for _ in range(count):
-        action = np.column_stack([command(random, frames, span) for _ in MOTORS])
-        action = np.round(action / COUNT_DEG) * COUNT_DEG
-        state = [follow(action[:, i], planted.get(m, Planted()), random) for i, m in enumerate(MOTORS)]
-        made.append((action, np.column_stack(state)))
+        action = np.column_stack([command(random, frames, 80.0) for _ in MOTORS])
+        state = action + random.normal(0, 0.05, action.shape)
+        made.append(tuple(np.round(values / COUNT_DEG) * COUNT_DEG for values in (action, state)))
     return made
 
 

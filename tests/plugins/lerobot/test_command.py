@@ -16,7 +16,7 @@ from armcal_lerobot.motor_files import Gripper, Motor, wiring_of
 from armcal_servobus.joints import drivable
 from click.testing import CliRunner
 
-from tests.plugins.lerobot.planted import episodes, motor_entries, write_dataset, write_motors
+from tests.plugins.lerobot.planted import motor_entries, write_motors
 
 CONFIGS = Path(__file__).parents[3] / "configs" / "so101"
 ARM = str(CONFIGS / "arm.yaml")
@@ -210,18 +210,6 @@ def test_a_question_before_anything_is_written(
     assert path.read_text() == text
 
 
-def test_a_data_set_is_compared(tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
-    data = write_dataset(tmp_path / "set", episodes({}, count=3, frames=400))
-    assert "What a data set cannot show" in called("compare", data)
-    content = json_of("compare", data)
-    file = write_motors(tmp_path / "arm.json")
-    percent = json_of("compare", data, "--units", "percent", "--calibration", file)
-    assert percent["motors"]["elbow_flex"]["span"] == pytest.approx(
-        content["motors"]["elbow_flex"]["span"] * 1137.5 * 360 / 4095 / 100, rel=1e-6
-    )
-
-
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
@@ -249,7 +237,7 @@ def test_options_without_an_arm_are_refused(tmp_path: Path) -> None:
             called("check", path, *options)
     pytest.importorskip("pyarrow")
     with pytest.raises(ArmcalError, match=r"meta/info\.json: there is no such file"):
-        called("compare", path.parent)
+        called("rests", path.parent, "--out", path.parent / "rests.csv")
 
 
 def test_joints_without_a_motor_are_named(tmp_path: Path) -> None:
@@ -279,13 +267,3 @@ def test_zeros_of_a_misspelt_joint_are_refused(tmp_path: Path, calibrated: Path)
         called("zeros", calibrated, path, "--joint", "shoulder_pan=elbow_flex", "--yes")
     with pytest.raises(InputError, match="found elbow_flex twice"):
         called("check", path, "--arm", ARM, "--joint", "elbow_flex=shoulder_pan")
-
-
-def test_states_that_were_copied_from_commands_are_named(tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
-    made = episodes({}, count=2, frames=200)
-    same = write_dataset(tmp_path / "same", [(state, state) for _, state in made])
-    assert "Every state is a command" in called("compare", same)
-    late = write_dataset(tmp_path / "late", [(np.r_[state[1:], state[-1:]], state) for _, state in made])
-    assert "Every state is a command" in called("compare", late)
-    assert "Every state" not in called("compare", write_dataset(tmp_path / "set", made))

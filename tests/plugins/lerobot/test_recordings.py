@@ -21,7 +21,7 @@ VERSIONS = ("v2.1", "v3.0")
 
 @pytest.fixture(params=VERSIONS)
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return write_dataset(tmp_path / "data_set", episodes({}, count=3, frames=60), request.param)
+    return write_dataset(tmp_path / "data_set", episodes(count=3, frames=60), request.param)
 
 
 def files(folder: Path) -> list[Path]:
@@ -42,7 +42,7 @@ def all_of(recording: Recording) -> list:
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_numbers_are_those_that_were_recorded(tmp_path: Path, version: str) -> None:
-    made = episodes({}, count=3, frames=5000)
+    made = episodes(count=3, frames=5000)
     recording = open_recording(write_dataset(tmp_path / "set", made, version))
     assert recording.motors == MOTORS and recording.fps == 30
     read = all_of(recording)
@@ -59,7 +59,7 @@ def test_a_gap_ends_a_stretch(folder: Path) -> None:
     pq.write_table(table, path)
     info = folder / "meta" / "info.json"
     info.write_text(info.read_text().replace('"total_frames": 180', '"total_frames": 175'))
-    stretches = open_recording(folder).motion
+    stretches = open_recording(folder).stretches
     assert [(s.episode, int(s.frame[0]), len(s.frame)) for s in stretches][:2] == [(0, 0, 20), (0, 25, 35)]
 
 

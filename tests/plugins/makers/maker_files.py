@@ -12,7 +12,7 @@ from pathlib import Path
 import armcal_makers
 import numpy as np
 import yaml
-from armcal_makers.arms import nominal_arms, six_of
+from armcal_makers.files import nominal_arms, six_of
 
 UR5_DELTAS = (
     (

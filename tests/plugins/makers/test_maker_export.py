@@ -13,7 +13,7 @@ from armcal.base.settings import Settings
 from armcal.calibration.exporter import request_of
 from armcal.cli.main import cli
 from armcal.errors import ConfigError, InputError
-from armcal_makers.export import UrExporter, UrSettings, XarmExporter
+from armcal_makers.files import UrExporter, UrSettings, XarmExporter
 from click.testing import CliRunner
 
 from tests.made_calibrations import made_calibration

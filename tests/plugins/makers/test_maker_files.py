@@ -14,7 +14,7 @@ from armcal.calibration.rigid_chain import tool_poses
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.plugins import discover
-from armcal_makers.arms import at_zero, nominal_arms, read_kinematics, tips
+from armcal_makers.files import at_zero, nominal_arms, read_kinematics, tips
 from click.testing import CliRunner
 
 from tests.plugins.makers.maker_files import (

@@ -14,8 +14,8 @@ import recorded_bags as bags
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError
 from armcal.run.experiment import Experiment
-from armcal_ros2.bag import Bag
 from armcal_ros2.bag_command import survey
+from armcal_ros2.reader import Bag
 from rosbags.rosbag2 import Reader
 
 KINDS = [("mcap", ""), ("mcap", "storage"), ("sqlite3", "")]
@@ -62,7 +62,8 @@ def test_only_chosen_topics_are_read_and_all_are_counted(tour: bags.Tour, storag
     with Reader(bag) as reader:
         expected = [(c.topic, t, bytes(data)) for c, t, data in reader.messages()]
     chosen = Bag(bag)
-    messages = [(m.topic.name, m.received, m.data) for m in chosen.messages(lambda topic: topic.name == "/tip")]
+    read = chosen.messages(lambda topic: topic.name == "/tip")
+    messages = [(topic.name, received, data) for topic, received, data, _ in read]
     assert messages == [one for one in expected if one[0] == "/tip"]
     assert chosen.topics.total() == len(expected)
 

@@ -132,7 +132,7 @@ def test_all_servos_are_found():
             (1, "sts3215", "3.10", 10), (3, "sts3215", "3.10", 30), (250, "sts3215", "3.10", 40)
         ]  # fmt: skip
         assert found_servos[1].alarms == ("overload",) and found_servos[0].voltage_V == 12.1
-        assert not any(s.is_doubled for s in found_servos)
+        assert not any(s.doubled for s in found_servos)
         bus.close()
 
 
@@ -158,7 +158,7 @@ def test_two_servos_with_one_id_are_seen(protocol):
     servo = xl430 if protocol == 2 else sts
     with FakeBus([servo(2), servo(3, 100), servo(3, 900)], protocol) as fake:
         bus = opened(fake, reply_ms=20)
-        doubled = {s.id: s.is_doubled for s in servos_on(bus, range(5))}
+        doubled = {s.id: s.doubled for s in servos_on(bus, range(5))}
         assert doubled == {2: False, 3: True}
         bus.close()
 
@@ -179,6 +179,6 @@ def test_two_servos_that_talk_at_once_are_seen():
 
         bus = opened(fake, reply_ms=20)
         fake.mangle = collide
-        doubled = {s.id: s.is_doubled for s in servos_on(bus, range(5))}
+        doubled = {s.id: s.doubled for s in servos_on(bus, range(5))}
         assert doubled == {2: False, 3: True}
         bus.close()

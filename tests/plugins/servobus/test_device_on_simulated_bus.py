@@ -125,10 +125,10 @@ def test_they_are_found(desk):
         (1, desk.servos[0].table.name),
         (2, desk.servos[1].table.name),
     ]
-    assert not any(servo.is_doubled or servo.alarms for servo in there)
+    assert not any(servo.doubled or servo.alarms for servo in there)
     desk.servos[1]._put("id", 1)
     (both,) = (looked_at(bus, servo) for servo in present(bus, range(4)))
-    assert both.id == 1 and both.is_doubled
+    assert both.id == 1 and both.doubled
     bus.close()
 
 

@@ -6,9 +6,9 @@ import math
 
 import pytest
 from armcal.devices.device import DeviceRefusedError
+from armcal_servobus.bus import MODELS
 from armcal_servobus.device import ServoBusSettings
-from armcal_servobus.joints import ServoJoint, check_offset, drivable
-from armcal_servobus.models import MODELS
+from armcal_servobus.joints import ServoJoint, drivable
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -58,13 +58,13 @@ def test_a_range_over_the_seam_cannot_be_driven():
 
 
 def test_an_offset_beyond_the_register_is_refused_with_what_to_do():
-    check_offset(MODELS["sts3215"], -2047)
+    MODELS["sts3215"].check_offset(-2047)
     with pytest.raises(ValueError, match=r"-2047 to 2047.*remount it by 1 tooth of its horn \(14\.4 deg each\)"):
-        check_offset(MODELS["sts3215"], 2048)
+        MODELS["sts3215"].check_offset(2048)
     with pytest.raises(ValueError, match=r"remount it by 6 teeth"):
-        check_offset(MODELS["sts3215"], -3000)
+        MODELS["sts3215"].check_offset(-3000)
     with pytest.raises(ValueError, match=r"-1024 to 1024.*remount its horn by 26 deg or more"):
-        check_offset(MODELS["xl430-w250"], 1320)
+        MODELS["xl430-w250"].check_offset(1320)
 
 
 @pytest.mark.parametrize(

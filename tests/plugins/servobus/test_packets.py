@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from armcal_servobus.bus import FRAMINGS, Instruction
-from armcal_servobus.models import MAPS, Register
+from armcal_servobus.bus import FRAMINGS, MAPS, Instruction, Register
 from hypothesis import given
 from hypothesis import strategies as st
 

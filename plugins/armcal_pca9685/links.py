@@ -1,12 +1,15 @@
-"""A board that speaks the framed protocol: answers to everything, and looks after the arm by itself."""
+"""Links to a servo board: one that speaks the framed protocol and looks after the arm by itself, and Linux I2C."""
 
+import errno
+import fcntl
 import os
 import struct
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Annotated, Any, ClassVar, NoReturn
 
-from armcal.base.settings import Duration
+from armcal.base.settings import Duration, Settings
 from armcal.devices import framed
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceResetError
@@ -14,6 +17,8 @@ from armcal.devices.framed import DELIMITER, MAX_PAYLOAD, Code, Flag, Frame, Fra
 from armcal.devices.link import Counts, GuardedLink, Link, LinkIdentity
 from armcal.devices.serial_port import SerialPort, SerialPortSettings
 from armcal.errors import Location
+from armcal.plugins import library
+from pydantic import Field
 from typing_extensions import override
 
 _TRIES = 4
@@ -21,6 +26,7 @@ _REPLY_S = 0.1
 _RATE_STEPS = 16  # a count per second has so many
 _LARGEST = 0xFFFF
 _TARGETS_AT_ONCE = MAX_PAYLOAD // 6
+# Why a board refuses a request, and what to do
 _REFUSALS: Mapping[int, tuple[str, str]] = {
     Code.UNKNOWN_TYPE: ("its firmware does not know this request", "Load newer firmware."),
     Code.BAD_PAYLOAD: ("its firmware does not understand this request", "Load newer firmware."),
@@ -28,7 +34,6 @@ _REFUSALS: Mapping[int, tuple[str, str]] = {
     Code.NO_DATA: ("the device at {address} refuses {what}", "Check its power and wires."),
     Code.STUCK: ("its I2C bus is stuck: a line is held low", "Switch the servo board off and on."),
 }
-"""Why a board refuses a request, and what to do."""
 
 
 class FramedSettings(SerialPortSettings):
@@ -99,18 +104,12 @@ class FramedLink(GuardedLink, Link):
 
     @override
     def beat(self) -> None:
-        """Raises:
-        DeviceLostError: the board drives by itself.
-        """
         self._ask(Kind.BEAT, b"")
         if Flag.TOOK_OVER in self._flags:
             self._lose_to_board()
 
     @override
     def guard(self, waypoints: Sequence[Counts], counts_per_s: Mapping[tuple[int, int], float], after_s: float) -> None:
-        """Raises:
-        DeviceRefusedError: the waypoints are more than a frame holds.
-        """
         places = list(counts_per_s)
         most = (MAX_PAYLOAD - 4 - 4 * len(places)) // (2 * len(places)) if places else 0
         if places and len(waypoints) > most:
@@ -197,3 +196,81 @@ class FramedLink(GuardedLink, Link):
         self._port.close()
         text = "the board has heard nothing for too long and drives the arm by itself."
         raise DeviceLostError(text, where=self._where, hint="Open it again, and read where the arm is.")
+
+
+_I2C_TRIES = 3
+_GONE = (errno.ENODEV, errno.ENOENT, errno.EBADF, errno.ESHUTDOWN)
+
+
+class LinuxI2cSettings(Settings):
+    """The bus's number: N of ``/dev/i2c-N``."""
+
+    bus: Annotated[int, Field(ge=0, le=255)] = 1
+
+
+class LinuxI2cLink(Link):
+    """The link ``linux_i2c``. Such buses have no identity, and nothing counts their starts."""
+
+    Settings: ClassVar[type[LinuxI2cSettings]] = LinuxI2cSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {"bus": 1}
+
+    def __init__(self, settings: LinuxI2cSettings) -> None:
+        self._path = f"/dev/i2c-{settings.bus}"
+        self._bus: Any = None
+        self._smbus2: ModuleType | None = None
+
+    def open(self, clock: Clock) -> LinkIdentity:
+        self.close()
+        self._smbus2 = library("smbus2", "the link linux_i2c")
+        try:
+            self._bus = self._smbus2.SMBus(self._path)
+            fcntl.flock(self._bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as fault:
+            self.close()
+            message, hint = f"this I2C bus cannot be opened ({fault}).", "Check that it is an I2C bus."
+            if fault.errno == errno.ENOENT:
+                message, hint = "there is no such I2C bus.", "Enable I2C (raspi-config, or modprobe i2c-dev)."
+            elif fault.errno in (errno.EACCES, errno.EPERM):
+                message, hint = "this I2C bus may not be opened.", "Add yourself to its group (i2c) and log in anew."
+            elif fault.errno in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY):
+                message, hint = "another program has this I2C bus.", "Close it."
+            raise DeviceRefusedError(message, where=Location(self._path), hint=hint) from fault
+        return LinkIdentity("", f"Linux I2C, {self._path}")
+
+    @override
+    def write(self, address: int, data: bytes) -> None:
+        self._transfer(address, lambda library: [library.i2c_msg.write(address, data)])
+
+    @override
+    def read(self, address: int, register: int, count: int) -> bytes:
+        made = self._transfer(
+            address, lambda library: [library.i2c_msg.write(address, [register]), library.i2c_msg.read(address, count)]
+        )
+        return bytes(made[1])
+
+    @override
+    def close(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.close()
+
+    def _transfer(self, address: int, messages: Callable[[Any], list[Any]]) -> list[Any]:
+        """One transaction; what a device does not acknowledge is tried again."""
+        if self._bus is None:
+            raise DeviceLostError("the I2C bus is not open.", where=Location(self._path), hint="Open it again.")
+        fault: OSError | None = None
+        for _ in range(_I2C_TRIES):
+            made = messages(self._smbus2)
+            try:
+                self._bus.i2c_rdwr(*made)
+                return made
+            except OSError as raised:
+                fault = raised
+                if fault.errno in _GONE:
+                    self.close()
+                    raise DeviceLostError(
+                        f"the I2C bus is gone ({fault}).", where=Location(self._path), hint="Look at its adapter."
+                    ) from fault
+        text = f"the device at 0x{address:02x} does not answer ({fault})."
+        hint = f"Check its address, power and wires; i2cdetect -y {self._path.rpartition('-')[2]} lists who answers."
+        raise DeviceError(text, where=Location(self._path), hint=hint) from fault
