@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armcal.arm.assembly import Arm, command_channels
 from armcal.arm.pose_residual import LEAST_MARGIN, MARGIN
@@ -63,15 +63,6 @@ class PredictionRecord(Settings):
             for name, own in self.columns.items()
             if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
         }
-
-    @model_validator(mode="before")
-    @classmethod
-    def _as_before(cls, record: Any) -> Any:
-        """Earlier versions kept the records that tell of a drift."""
-        if isinstance(record, dict) and "recording" in record:
-            before = record["recording"] or {}
-            record = {**{k: v for k, v in record.items() if k != "recording"}, "drifts": before.get("drifts", {})}
-        return record
 
     @property
     def symmetric_covariance(self) -> Array:
