@@ -26,8 +26,7 @@ from armcal.measure.measurement import borrowed_names
 from armcal.problem.problem import Problem
 from armcal.report.document import Document, Section, Table
 from armcal.run.experiment import Experiment, PlanSettings
-from armcal.run.plan import NAMES, POINTS, PlanResult, make_iso_plan, make_plan
-from armcal.run.plan_poses import counts_text, read_poses, stated_beyond
+from armcal.run.plan import NAMES, POINTS, PlanResult, counts_text, make_iso_plan, make_plan, read_poses, stated_beyond
 
 _SHOWN = 8
 _LARGEST_CUBE_MM = 10_000.0
