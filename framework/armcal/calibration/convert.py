@@ -24,7 +24,6 @@ from armcal.base.quaternions import quaternion_of, rpy_of
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.rigid_chain import (
     RigidChain,
-    RigidJoint,
     largest_difference,
     numeric_chain,
     random_commands,
@@ -45,8 +44,6 @@ _SAME_MOUNT = 1e-9
 
 @dataclass(frozen=True)
 class ConvertSource:
-    """What is converted."""
-
     arm: str  # the arm's instance name
     chain: Chain  # of constants: nominal ones of a configuration, calibrated ones of a calibration
     left: tuple[str, ...]  # what of the file belongs to the arm and is not in the chain, in words
@@ -54,10 +51,7 @@ class ConvertSource:
 
 @dataclass(frozen=True)
 class Difference:
-    """Between two chains: the largest distance (m) and angle (rad) over random poses, and how many these were.
-
-    ``same_mount`` says whether their mounts are the same too.
-    """
+    """Between two chains, the largest over random poses."""
 
     position_m: float
     angle_rad: float
@@ -175,7 +169,15 @@ def urdf_text(chain: RigidChain, name: str) -> str:
         lines.append(f'  <joint name={_attribute(joint.name)} type="{"prismatic" if joint.slides else turning}">')
         lines += _placed(here, joint.base_T_joint, parent, child)
         lines.append(f'    <axis xyz="{_words(numbers(joint.axis))}"/>')
-        lines += [*_bounds(joint), "  </joint>", f'  <link name="{child}"/>']
+        if joint.limits and not joint.endless:
+            lower, upper = (repr(float(end)) for end in joint.limits)
+            lines.append(f'    <limit lower="{lower}" upper="{upper}" effort="{UNKNOWN}" velocity="{UNKNOWN}"/>')
+        elif joint.slides:
+            lines.append(f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>')
+        if joint.mimic is not None:
+            ratio = f'multiplier="{joint.mimic.multiplier!r}" offset="{joint.mimic.offset!r}"'
+            lines.append(f"    <mimic joint={_attribute(joint.mimic.master)} {ratio}/>")
+        lines += ["  </joint>", f'  <link name="{child}"/>']
         parent, here = child, joint.base_T_joint
     tip, taken = "tip", {joint.name for joint in chain.joints}
     while tip in taken:
@@ -193,19 +195,8 @@ def _placed(base_T_parent: Array, base_T_child: Array, parent: str, child: str) 
     yield f'    <child link="{child}"/>'
 
 
-def _bounds(joint: RigidJoint) -> Iterator[str]:
-    if joint.limits and not joint.endless:
-        lower, upper = (repr(float(end)) for end in joint.limits)
-        yield f'    <limit lower="{lower}" upper="{upper}" effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
-    elif joint.slides:
-        yield f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
-    if joint.mimic is not None:
-        numbers = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
-        yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(numbers)}/>"
-
-
 def _words(values: list[float]) -> str:
-    return " ".join(repr(value) for value in values)
+    return " ".join(map(repr, values))
 
 
 def _attribute(text: str) -> str:
@@ -234,8 +225,7 @@ class Link:
     alpha: float = 0.0
     turn: float = 0.0
 
-    def along(self) -> Array:
-        """Rot_z(theta) Trans_z(d) as a 4x4 matrix."""
+    def along(self) -> Array:  # Rot_z(theta) Trans_z(d)
         return _motion("z", self.theta, self.d)
 
     def across(self, convention: Convention) -> Array:
@@ -259,43 +249,22 @@ def mdh_section(chain: RigidChain, convention: Convention) -> dict[str, Any]:
         links.append(link)
         frame = frame @ link.across(convention)
     tool: Array = np.asarray(np.linalg.solve(frame, chain.base_T_tool))
-    rows = _standard_rows(links) if convention == "standard" else _craig_rows(links)
+    rows: list[dict[str, Any]] = []
+    for before, here in zip([Link(), *links], [*links, Link()], strict=True):
+        across = here if convention == "standard" else before
+        turn = {"ry_deg": _degrees(across.turn)}
+        row: dict[str, Any] = {"alpha_deg": _degrees(across.alpha), "theta_deg": _degrees(here.theta)}
+        row |= {"a_mm": _millimetres(across.a), "d_mm": _millimetres(here.d)}
+        if across.turn and convention == "standard":
+            row["after"] = [turn]
+        elif across.turn:
+            row |= {"a_mm": 0.0, "before": [{"x_mm": _millimetres(across.a)}, turn]}
+        rows.append(row)
     for row, joint in zip(rows, chain.joints, strict=True):
         if joint.slides:
             row["kind"] = "prismatic"
-    names = [joint.name for joint in chain.joints]
-    return {
-        "type": "mdh",
-        "convention": convention,
-        "joints": names,
-        "base": _steps(base),
-        "rows": rows,
-        "tool": _steps(tool),
-    }
-
-
-def _standard_rows(links: list[Link]) -> list[dict[str, Any]]:
-    rows = []
-    for link in [*links, Link()]:
-        after = {"after": [{"ry_deg": _degrees(link.turn)}]} if link.turn else {}
-        rows.append({**_row(link.theta, link.d, link.a, link.alpha), **after})
-    return rows
-
-
-def _craig_rows(links: list[Link]) -> list[dict[str, Any]]:
-    rows = []
-    for before, here in zip([Link(), *links], [*links, Link()], strict=True):
-        if before.turn:
-            steps = [{"x_mm": _millimetres(before.a)}, {"ry_deg": _degrees(before.turn)}]
-            rows.append({**_row(here.theta, here.d, 0.0, before.alpha), "before": steps})
-        else:
-            rows.append(_row(here.theta, here.d, before.a, before.alpha))
-    return rows
-
-
-def _row(theta: float, d: float, a: float, alpha: float) -> dict[str, Any]:
-    lengths = {"a_mm": _millimetres(a), "d_mm": _millimetres(d)}
-    return {"alpha_deg": _degrees(alpha), "theta_deg": _degrees(theta), **lengths}
+    head = {"type": "mdh", "convention": convention, "joints": [joint.name for joint in chain.joints]}
+    return {**head, "base": _steps(base), "rows": rows, "tool": _steps(tool)}
 
 
 def _link(frame: Array, point: Array, direction: Array, convention: Convention) -> Link:
