@@ -231,10 +231,9 @@ class Calibration:
             )
         fitted = self.nominal.with_free(self.free)
         try:
-            components = tuple(
-                Component(**{key: math.nan if value is None else value for key, value in stated.items()})
-                for stated in noise.get("components", ())
-            )
+            listed: list[dict[str, Any]] = noise.get("components", [])
+            stated: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in own.items()} for own in listed]
+            components = tuple(Component(**own) for own in stated)
             measure = (float(noise["scale"]), float(noise["degrees_of_freedom"]))
         except (KeyError, TypeError, ValueError) as fault:
             text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
