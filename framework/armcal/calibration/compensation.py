@@ -346,19 +346,14 @@ class Rounding:
     solver: Solver
 
     def __call__(
-        self, record: Array, solutions: Solutions, target: Array, allowed: Allowed | None
-    ) -> tuple[Counts, Array]:
-        """Counts and what they make (n x N each) for records with the exact commands, and targets (3 or 12 x N)."""
-        counts, commands = np.zeros(solutions.commands.shape, dtype=np.int64), np.zeros_like(solutions.commands)
-        for start in range(0, record.shape[1], _ROUNDED_AT_ONCE):
-            part = slice(start, start + _ROUNDED_AT_ONCE)
-            some = solutions.commands[:, part], solutions.states[:, part], target[:, part]
-            counts[:, part], commands[:, part] = self._part(record[:, part], *some, allowed)
-        return counts, commands
-
-    def _part(
         self, record: Array, exact: Array, states: Array, target: Array, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
+        """Counts and what they make (n x N each) for records with the exact commands, and targets (3 or 12 x N)."""
+        if record.shape[1] > _ROUNDED_AT_ONCE:
+            starts = range(0, record.shape[1], _ROUNDED_AT_ONCE)
+            columns = [slice(start, start + _ROUNDED_AT_ONCE) for start in starts]
+            parts = [self(record[:, s], exact[:, s], states[:, s], target[:, s], allowed) for s in columns]
+            return np.hstack([counts for counts, _ in parts]), np.hstack([commands for _, commands in parts])
         joints, count = exact.shape
         left = _left(self.equilibrium(record, states).base_T_tool, target)
         weights = np.array([1.0] * 3 + [self.solver.length] * (len(left) - 3))[:, None]
@@ -586,7 +581,8 @@ class Compensator:
         record[:joints] = solutions.commands
         rounding = self._kind("position" if targets.rotations is None else "pose")[1]
         if rounding is not None:
-            counts, record[:joints] = rounding(record, solutions, _goal(targets), self._allowed)
+            exact = solutions.commands, solutions.states
+            counts, record[:joints] = rounding(record, *exact, _goal(targets), self._allowed)
             if self._allowed is not None:
                 barred = solutions.there & ~self._allowed(record[:joints])
                 solutions.there[barred], solutions.forbidden[barred] = False, True

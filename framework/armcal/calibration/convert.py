@@ -62,7 +62,13 @@ class Difference:
 def load_source(path: str | Path, arm: str | None, registry: PluginRegistry) -> ConvertSource:
     """The chain of an arm of a configuration or a calibration."""
     source = load_config(path)
-    name = _named(source, arm)
+    arms = source.data.get("arms")
+    if not isinstance(arms, dict) or not arms:
+        hint = "Give a configuration or a calibration.yaml."
+        raise ConfigError("found no arms.", where=Location(str(source.path)), hint=hint)
+    name = arm_named([str(own) for own in arms], arm, source.where(("arms",)))
+    if not isinstance(arms[name], dict) or "model" not in arms[name]:
+        source.refuse(("arms", name), f"the arm {name!r} has no model.", "Write model: {type: NAME, ...}.")
     if "armcal_calibration" in source.data:
         loaded = Calibration.load(path, registry)
         source_arm = loaded.system.arms[name]
@@ -91,18 +97,6 @@ def difference(one: Chain, two: Chain) -> Difference:
     commands = random_commands(known, POSES, _SEED)
     same_mount = bool(np.abs(known.base_T_mount - rigid_chain(two).base_T_mount).max() < _SAME_MOUNT)
     return Difference(*largest_difference(tool_poses(one, commands), tool_poses(two, commands)), POSES, same_mount)
-
-
-def _named(source: ConfigSource, arm: str | None) -> str:
-    arms = source.data.get("arms")
-    if not isinstance(arms, dict) or not arms:
-        raise ConfigError(
-            "found no arms.", where=Location(str(source.path)), hint="Give a configuration or a calibration.yaml."
-        )
-    name = arm_named([str(own) for own in arms], arm, source.where(("arms",)))
-    if not isinstance(arms[name], dict) or "model" not in arms[name]:
-        source.refuse(("arms", name), f"the arm {name!r} has no model.", "Write model: {type: NAME, ...}.")
-    return name
 
 
 def _described(
@@ -238,7 +232,11 @@ def mdh_section(chain: RigidChain, convention: Convention) -> dict[str, Any]:
     """Rows, and steps before and after them."""
     require_independent(chain, "mdh")
     require_plain_axes(chain, "mdh")
-    frame = _frame_on(chain.joints[0].base_T_joint, chain.joints[0].direction)
+    direction, frame = chain.joints[0].direction, np.array(chain.joints[0].base_T_joint)
+    x = frame[:3, 0] if abs(frame[:3, 0] @ direction) < 0.9 else frame[:3, 1]
+    x = x - direction * (direction @ x)
+    x = x / np.linalg.norm(x)
+    frame[:3, :3] = np.column_stack([x, np.cross(direction, x), direction])  # z along the first axis
     links: list[Link] = []
     base: Array = frame
     for i, beyond in enumerate(chain.joints[1:]):
@@ -272,7 +270,16 @@ def _link(frame: Array, point: Array, direction: Array, convention: Convention) 
     p, w = frame[:3, :3].T @ (point - frame[:3, 3]), frame[:3, :3].T @ direction
     sine = math.hypot(w[0], w[1])
     if sine < NEARLY_PARALLEL:
-        return _nearly_parallel(p - w * (p[2] / w[2]), w, convention)
+        foot = p - w * (p[2] / w[2])
+        a = math.hypot(foot[0], foot[1])
+        theta = math.atan2(foot[1], foot[0]) if a > _NOWHERE else 0.0
+        x, y, z = _motion("z", -theta, 0.0)[:3, :3] @ w
+        side = math.copysign(1.0, z)
+        if convention == "standard":
+            alpha, turn = math.atan2(-y, z), math.asin(x)
+        else:
+            alpha, turn = math.atan2(-y, side * math.hypot(x, z)), math.atan2(side * x, side * z)
+        return Link(theta, 0.0, a if a > _NOWHERE else 0.0, alpha, turn if abs(turn) > _NOTHING else 0.0)
     normal = np.array([-w[1], w[0]]) / sine
     a = float(normal @ p[:2])
     # Towards the next axis; forwards where the two nearly meet, so that a small correction does not turn the row over.
@@ -282,27 +289,6 @@ def _link(frame: Array, point: Array, direction: Array, convention: Convention) 
     d = float(p[2] - w[2] * (p[:2] @ w[:2]) / sine**2)
     alpha = math.atan2(normal[0] * w[1] - normal[1] * w[0], w[2])
     return Link(math.atan2(normal[1], normal[0]), d, a if abs(a) > _NOTHING else 0.0, -alpha)
-
-
-def _nearly_parallel(foot: Array, w: Array, convention: Convention) -> Link:
-    a = math.hypot(foot[0], foot[1])
-    theta = math.atan2(foot[1], foot[0]) if a > _NOWHERE else 0.0
-    x, y, z = _motion("z", -theta, 0.0)[:3, :3] @ w
-    side = math.copysign(1.0, z)
-    if convention == "standard":
-        alpha, turn = math.atan2(-y, z), math.asin(x)
-    else:
-        alpha, turn = math.atan2(-y, side * math.hypot(x, z)), math.atan2(side * x, side * z)
-    return Link(theta, 0.0, a if a > _NOWHERE else 0.0, alpha, turn if abs(turn) > _NOTHING else 0.0)
-
-
-def _frame_on(frame: Array, direction: Array) -> Array:
-    x = frame[:3, 0] if abs(frame[:3, 0] @ direction) < 0.9 else frame[:3, 1]
-    x = x - direction * (direction @ x)
-    x = x / np.linalg.norm(x)
-    placed = np.array(frame)
-    placed[:3, :3] = np.column_stack([x, np.cross(direction, x), direction])
-    return placed
 
 
 def _steps(pose: Array) -> list[dict[str, float]]:

@@ -59,13 +59,6 @@ class PredictionRecord(Settings):
             if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
         }
 
-    @property
-    def symmetric_covariance(self) -> Array:
-        lower = np.zeros((len(self.covariance), len(self.covariance)))
-        for i, row in enumerate(self.covariance):
-            lower[i, : i + 1] = row
-        return lower + np.tril(lower, -1).T
-
 
 @dataclass(frozen=True)
 class PlusMinus:
@@ -116,7 +109,10 @@ class Uncertainty:
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
             whitened = apply_components(problem, self.values, estimated, axes)
-        by = Predictor(self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom)
+        lower = np.zeros((len(self.record.covariance),) * 2)
+        for i, row in enumerate(self.record.covariance):
+            lower[i, : i + 1] = row
+        by = Predictor(self.values, lower + np.tril(lower, -1).T, self.noise_scale, self.freedom)
         spreads = self._from_either_side(problem, by.spreads(whitened, "new"), commands)
         return _Part(places, spreads, reading_slopes(problem, self.values))
 
@@ -157,16 +153,6 @@ class _Part:
     spreads: tuple[Spread, ...]  # of their residuals, by factor
     slopes: tuple[Array | None, ...]  # of the readings by residuals (N x outputs x n_r)
 
-    def of_readings(self, place: int) -> Spread | None:
-        """The spread of the readings of one factor: None where they do not follow from residuals, NaN of idle ones."""
-        slope, spread = self.slopes[place], self.spreads[place]
-        if slope is None:
-            return None
-        covariance = slope @ spread.covariance @ slope.transpose(0, 2, 1)
-        idle = ~np.any(slope != 0, axis=2)
-        covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
-        return Spread(covariance, spread.freedom)
-
 
 def _joined(problem: Problem, parts: Sequence[_Part], count: int, own: Stretch | None) -> PlusMinus:
     plus_minus = PlusMinus({}, {}, {})
@@ -174,12 +160,16 @@ def _joined(problem: Problem, parts: Sequence[_Part], count: int, own: Stretch |
     factor = own.radius if own and own.radius is not None else 1.0
     for place, kernel in enumerate(problem.kernels):
         channels, name = kernel.factor.output_channels, kernel.factor.name
-        spreads = [part.of_readings(place) for part in parts]
-        if not channels or any(spread is None for spread in spreads):
-            continue
+        if not channels or any(part.slopes[place] is None for part in parts):
+            continue  # its readings do not follow from residuals
         rows, radius, turn = (np.full((*size, count), np.nan) for size in ((2, len(channels)), (), ()))
         covariance = np.full((count, len(channels), len(channels)), np.nan)
-        for part, spread in zip(parts, filter(None, spreads), strict=True):
+        for part in parts:
+            slope = np.asarray(part.slopes[place])
+            own_covariance = slope @ part.spreads[place].covariance @ slope.transpose(0, 2, 1)
+            idle = ~np.any(slope != 0, axis=2)  # a reading that no residual depends on is not known to any extent
+            own_covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
+            spread = Spread(own_covariance, part.spreads[place].freedom)
             rows[:, :, part.places] = spread.deviations, stretch * spread.half_widths(STATED)
             covariance[part.places] = stretch**2 * spread.covariance
             if is_position(kernel):

@@ -103,7 +103,14 @@ def tool_error(own_slopes: Slopes, target: Expression, aim: Aim) -> tuple[Expres
         return away, slope
     here, moved = ca.reshape(own_slopes.corrected[:9], 3, 3), _twists(own_slopes)
     if aim == "pose":
-        return ca.vertcat(away, _rotation_vector(here, ca.reshape(target[3:], 3, 3))), moved
+        # The turn (rad, base frame) as a rotation vector; nothing is differentiated through it.
+        there = ca.reshape(target[3:], 3, 3)
+        sine = sum((ca.cross(here[:, i], there[:, i]) for i in range(3)), ca.SX(3, 1)) / 2
+        cosine = (sum((ca.dot(here[:, i], there[:, i]) for i in range(3)), ca.SX(0)) - 1) / 2
+        size = ca.sqrt(ca.dot(sine, sine))
+        # Where both vanish together, as in a half turn, the direction is lost; elsewhere the ratio tends to one.
+        small = size < 1e-9
+        return ca.vertcat(away, sine * ca.if_else(small, 1, ca.atan2(size, cosine) / ca.if_else(small, 1, size))), moved
     axis, along = here @ target[6:9], target[3:6]
     about = ca.cross(axis, along)
     sine = ca.sqrt(ca.sumsqr(about))
@@ -267,16 +274,6 @@ def _step(
         return preferred + held.T @ lever, preference + slope.T @ lever
     step = preferred + se3.solve_near_identity(held.T @ held + damping * ca.SX.eye(count), held.T @ left)
     return step, damping * preference + slope.T @ (error - held @ step)
-
-
-def _rotation_vector(here: Expression, there: Expression) -> Expression:
-    """The turn (rad, base frame) from one rotation to another; nothing is differentiated through it."""
-    sine = sum((ca.cross(here[:, i], there[:, i]) for i in range(3)), ca.SX(3, 1)) / 2
-    cosine = (sum((ca.dot(here[:, i], there[:, i]) for i in range(3)), ca.SX(0)) - 1) / 2
-    size = ca.sqrt(ca.dot(sine, sine))
-    # Where both vanish together, as in a half turn, the direction is lost; elsewhere the ratio tends to one.
-    small = size < 1e-9
-    return sine * ca.if_else(small, 1, ca.atan2(size, cosine) / ca.if_else(small, 1, size))
 
 
 @dataclass(frozen=True)
@@ -451,7 +448,18 @@ class Finder:
                 self._round(record, target, todo, self._picked(target[:, todo], used, wide), solutions)
             lost = lost[~solutions.there[lost]]
             used += wide
-        self._nearest(record, target, lost, solutions)
+        # Of targets that were not reached, the commands that come nearest; a longer search reaches some after all.
+        wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
+        for todo in _chunks(lost, wide + 1):
+            commands, states = self._seeds.at(self._picked(target[:, todo], 0, wide))
+            commands = np.concatenate([solutions.commands[:, todo, None], commands], axis=2)
+            states = np.concatenate([solutions.states[:, todo, None], states], axis=2)
+            attempt, _ = self._searched(record, target, todo, commands, states, NEAREST)
+            left = attempt.distances + self.solver.length * attempt.turns
+            left = np.where(self._may(attempt.commands), left, np.inf)
+            best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
+            solutions.put(todo, attempt, best)
+            solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])
         return solutions
 
     def postures(self, record: Array, target: Array, count: int) -> list[Array]:
@@ -548,21 +556,6 @@ class Finder:
         near = np.where(attempt.there, np.inf, left).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
         closer = ~had & (left[near] < solutions.distances[todo] + self.solver.length * solutions.turns[todo])
         solutions.put(todo[closer], attempt, near[closer])
-
-    def _nearest(self, record: Array, target: Array, lost: Indices, solutions: Solutions) -> None:
-        """Of targets that were not reached, the commands that come nearest; a longer search reaches some after all."""
-        wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
-        for todo in _chunks(lost, wide + 1):
-            picks = self._picked(target[:, todo], 0, wide)
-            commands, states = self._seeds.at(picks)
-            commands = np.concatenate([solutions.commands[:, todo, None], commands], axis=2)
-            states = np.concatenate([solutions.states[:, todo, None], states], axis=2)
-            attempt, _ = self._searched(record, target, todo, commands, states, NEAREST)
-            left = attempt.distances + self.solver.length * attempt.turns
-            left = np.where(self._may(attempt.commands), left, np.inf)
-            best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
-            solutions.put(todo, attempt, best)
-            solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])  # a longer search may arrive
 
     def _searched(
         self, record: Array, target: Array, todo: Indices, commands: Array, states: Array, manner: Manner = QUICK

@@ -47,35 +47,6 @@ _AS_DOCUMENTED = (
 _KINDS = {"quaternion": _QUATERNION, "angles": _RPY}
 
 
-def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistry) -> tuple[Targets, Dataset]:
-    """Targets of one arm; and the file's content: ids, columns that nothing asked for, rows set aside.
-
-    Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``; for a
-    rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y, then z).
-    Load, gravity, surroundings and approach stand as in measured data.
-    """
-    dataset = _read(path, expression, registry)
-    if not len(dataset):
-        raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
-    acting = np.repeat(expression.defaults[:, None], len(dataset), axis=1)
-    for i, channel in enumerate(expression.channels):
-        name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
-        if channel not in expression.joints and dataset.has(name):
-            acting[i] = dataset.column(name)
-    positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
-    row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
-    if abs(positions[row, axis]) > FARTHEST_M:
-        raise DataError(
-            f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
-            where=Location(str(path), line=_line(dataset, int(row)), field="xyz"[axis]),
-            hint="Check the number and the unit in the column's name.",
-        )
-    joints = len(expression.joints)
-    loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
-    conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
-    return Targets(positions, _rotations(path, dataset), loads, approaches, conditions), dataset
-
-
 def check_units(path: Path, targets: Targets, reach: Reach) -> None:
     """Positions ten times farther out than the arm reaches, or a hundredth of that: a unit is wrong."""
     away = float(np.median(np.linalg.norm(targets.positions, axis=1)))
@@ -114,10 +85,6 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
     return replace(dataset, warnings=(*dataset.warnings, text))
 
 
-def _line(dataset: Dataset, row: int) -> int:
-    return dataset.rows[row] if dataset.rows else row + 1
-
-
 def _rotations(path: Path, dataset: Dataset) -> Array | None:
     present = {kind: [name for name in names if dataset.has(name)] for kind, names in _KINDS.items()}
     given = [kind for kind, columns in present.items() if columns]
@@ -143,9 +110,10 @@ def _rotations(path: Path, dataset: Dataset) -> Array | None:
     norms = np.linalg.norm(stacked, axis=0)
     bad = np.flatnonzero(np.abs(norms - 1) > _NORM)
     if bad.size:
+        line = dataset.rows[bad[0]] if dataset.rows else int(bad[0]) + 1
         raise DataError(
             f"its quaternion has the norm {norms[bad[0]]:.4g}, expected 1.",
-            where=Location(str(path), line=_line(dataset, int(bad[0])), field=", ".join(_QUATERNION)),
+            where=Location(str(path), line=line, field=", ".join(_QUATERNION)),
             hint="Give unit quaternions, the real part first.",
         )
     return np.stack([rotation_matrix(q) for q in (stacked / norms).T])
@@ -183,8 +151,33 @@ class Bench:
         return self.point == "target" or self.target is None or not self.target.fitted
 
     def read(self, path: Path, registry: PluginRegistry) -> tuple[Targets, Dataset]:
-        conditions = self.calibration.system.arms[self.arm].conditions
-        targets, dataset = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
+        """Targets from a CSV; and the file's content: ids, columns that nothing asked for, rows set aside.
+
+        Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``;
+        for a rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y,
+        then z). Load, gravity, surroundings and approach stand as in measured data.
+        """
+        expression = self.calibration.expression(self.arm, self.calibration.system.arms[self.arm].conditions)
+        dataset = _read(path, expression, registry)
+        if not len(dataset):
+            raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
+        acting = np.repeat(expression.defaults[:, None], len(dataset), axis=1)
+        for i, channel in enumerate(expression.channels):
+            name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
+            if channel not in expression.joints and dataset.has(name):
+                acting[i] = dataset.column(name)
+        positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
+        row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
+        if abs(positions[row, axis]) > FARTHEST_M:
+            raise DataError(
+                f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
+                where=Location(str(path), line=dataset.rows[row] if dataset.rows else int(row) + 1, field="xyz"[axis]),
+                hint="Check the number and the unit in the column's name.",
+            )
+        joints = len(expression.joints)
+        loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
+        conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
+        targets = Targets(positions, _rotations(path, dataset), loads, approaches, conditions)
         self.calibration.require_payload(dataset.has("payload"), str(path))
         return targets, dataset
 

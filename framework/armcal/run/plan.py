@@ -131,7 +131,23 @@ def _pool_of(
     kind = "listed" if listed is not None else settings.candidates or usual
     if kind == "continuous":
         return spread(settings, space, limits, check)
-    poses = _grid(settings, space) if kind == "grid" else commands_of(read_poses(experiment, listed), space)
+    if kind == "grid":
+        given = space.by_joint(settings.levels, settings.travel, ("levels", "travel"))
+        if missing := [name for name in space.names if name not in given]:
+            raise ConfigError(
+                f"found no levels for {', '.join(missing)}.",
+                hint="Give plan.levels (plan.travel for sliding joints): {q1: [-100 deg, 0 deg, 100 deg], ...}.",
+            )
+        total = math.prod(len(given[name]) for name in space.names)
+        if total > _MOST_GRID:
+            raise ConfigError(
+                f"the grid has {total} poses, expected at most {_MOST_GRID}.",
+                hint="Give fewer levels, or plan.candidates: continuous.",
+            )
+        axes = np.meshgrid(*[given[name] for name in space.names], indexing="ij")
+        poses = _dataset_of(np.array([axis.ravel() for axis in axes]), space)
+    else:
+        poses = commands_of(read_poses(experiment, listed), space)
     pool, angles = Pool(kind, poses, {}), poses.stacked(space.channels)
     outside = np.any((angles < limits[:, :1] - _SAME_POSE) | (angles > limits[:, 1:] + _SAME_POSE), axis=0)
     pool = pool.without(outside, "beyond joint limits")
@@ -216,23 +232,6 @@ def counts_text(left_out: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in left_out.items()) or "none was given"
 
 
-def _grid(settings: PlanSettings, space: JointSpace) -> Dataset:
-    given = space.by_joint(settings.levels, settings.travel, ("levels", "travel"))
-    if missing := [name for name in space.names if name not in given]:
-        raise ConfigError(
-            f"found no levels for {', '.join(missing)}.",
-            hint="Give plan.levels (plan.travel for sliding joints): {q1: [-100 deg, 0 deg, 100 deg], ...}.",
-        )
-    total = math.prod(len(given[name]) for name in space.names)
-    if total > _MOST_GRID:
-        raise ConfigError(
-            f"the grid has {total} poses, expected at most {_MOST_GRID}.",
-            hint="Give fewer levels, or plan.candidates: continuous.",
-        )
-    axes = np.meshgrid(*[given[name] for name in space.names], indexing="ij")
-    return _dataset_of(np.array([axis.ravel() for axis in axes]), space)
-
-
 def options_within(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Options:
     """Compensation within limits and clearance of a configuration's ``plan``, for an arm with these joints."""
     experiment = Experiment.load(path, registry=registry)
@@ -312,24 +311,6 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
     measured = [f"{name}.{c.name}" for name, m in experiment.system.measurements.items() for c in m.channels()]
     missing = [channel for channel in measured if channel not in dataset.channels]
     return with_channels(dataset, {channel: np.zeros(len(dataset)) for channel in missing})
-
-
-def in_order_of_visit(context: PlanContext, chosen: Dataset, *, keeps_approaches: bool) -> tuple[Dataset, float]:
-    """The poses in the order of visit, with its approaches unless planned ones are kept; and the time it takes (s)."""
-    settings, space = context.settings, context.space
-    given = space.by_joint(
-        {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
-        {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
-        ("speeds_deg_per_s", "speeds_mm_per_s"),
-    )
-    speeds = [given.get(n, np.array([_SPEEDS[d]])) for n, d in zip(space.names, space.dimensions, strict=True)]
-    times = travel_times(chosen.stacked(space.channels), np.concatenate(speeds))
-    order = quick_order(times) if settings.order == "travel" else np.arange(len(chosen))
-    visited = chosen.subset(order)
-    by_order = dict(zip(approach_channels(space), approach_of(visited.stacked(space.channels)), strict=True))
-    channels = by_order | dict(visited.channels) if keeps_approaches else dict(visited.channels) | by_order
-    numbers = tuple(str(i) for i in range(1, len(order) + 1))
-    return replace(visited, channels=channels, extra={"order": numbers}), path_time(times, order)
 
 
 def travel_times(joint_angles: Array, speeds: Array) -> Array:
@@ -501,7 +482,12 @@ def make_plan(
         allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else check
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
-    return _result(context, task, _between(context, task, plan, pool), pool, refined)
+    if pool.kind == "continuous" and pool.dataset.has(approach_channels(space)[0]):
+        # Servos have play: some poses between the levels of the others.
+        poses = pool.dataset.stacked(space.channels)
+        chosen = with_poses_between(poses, space.limits(settings), plan.chosen)
+        plan = replace(plan, chosen=chosen, value=value_of(task.candidates, chosen))
+    return _result(context, task, plan, pool, refined)
 
 
 def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
@@ -573,27 +559,30 @@ def _refined(
     return task, plan, pool, int(np.sum(plan.chosen >= number))
 
 
-def _between(context: PlanContext, task: Task, plan: Plan, pool: Pool) -> Plan:
-    """The plan with some poses between the levels of the others, where servos have play and poses can be anywhere."""
-    space = context.space
-    if pool.kind != "continuous" or not pool.dataset.has(approach_channels(space)[0]):
-        return plan
-    poses = pool.dataset.stacked(space.channels)
-    chosen = with_poses_between(poses, space.limits(context.settings), plan.chosen)
-    return replace(plan, chosen=chosen, value=value_of(task.candidates, chosen))
-
-
 def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: int) -> PlanResult:
-    """A plan's figures."""
+    settings, space = context.settings, context.space
     parameters, chosen, bound = context.parameters, pool.dataset.subset(plan.chosen), plan.relaxation.bound
     measured = Task(Candidates(context.base, context.rows(chosen)), task.count)
     everything = np.arange(task.count)
     triangle = measured.candidates.triangle(everything)
     given = 0 if context.given is None else len(context.given)
     equations = (task.count + given) * measured.candidates.rows.shape[0] + len(context.priors)
-    dataset, seconds = in_order_of_visit(context, chosen, keeps_approaches=pool.kind in PLANNED)
+    speeds = space.by_joint(
+        {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
+        {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
+        ("speeds_deg_per_s", "speeds_mm_per_s"),
+    )
+    known = zip(space.names, space.dimensions, strict=True)
+    by_joint = np.concatenate([speeds.get(name, np.array([_SPEEDS[dimension]])) for name, dimension in known])
+    times = travel_times(chosen.stacked(space.channels), by_joint)
+    order = quick_order(times) if settings.order == "travel" else np.arange(len(chosen))
+    visited = chosen.subset(order)
+    # Approaches are what this order makes them, unless planned ones are kept.
+    sides = dict(zip(approach_channels(space), approach_of(visited.stacked(space.channels)), strict=True))
+    channels = sides | dict(visited.channels) if pool.kind in PLANNED else dict(visited.channels) | sides
+    numbers = tuple(str(i) for i in range(1, len(order) + 1))
     return PlanResult(
-        dataset=dataset,
+        dataset=replace(visited, channels=channels, extra={"order": numbers}),
         pool=pool,
         given=given,
         equations=equations,
@@ -604,7 +593,7 @@ def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: i
         names=parameters.coordinate_names,
         deviations=np.array([deviations(part) for part in (context.base, triangle)]) * parameters.scales(),
         identifiability=_identifiability(measured, everything, parameters),
-        travel_s=seconds,
+        travel_s=path_time(times, order),
         starts=plan.starts,
         refined=refined,
     )

@@ -325,7 +325,7 @@ def compare(
     judged = [_judged(name, ready[name], by_name[name], whole) for name in ready]
     variants = _compared(judged, settings)
     best, simplest = _choices(variants, settings)
-    trained = {name: _by_training(by_name[name], (whole, *parts)) for name in ready} if parts else {}
+    trained = {name: _by_training(ready[name], by_name[name], (whole, *parts)) for name in ready} if parts else {}
     return StudyResult(
         name=study.name,
         command=command,
@@ -339,8 +339,13 @@ def compare(
         group_by=settings.group_by,
         labels=labels,
         groups={name: len(rows) for name, rows in groups.items()},
-        cells=tuple(cell for name, own in trained.items() for cell in _cells(name, ready[name], own, groups)),
-        trained_mm={(n, at): o.errors_mm for n, own in trained.items() for at, o in own.items()},
+        cells=tuple(
+            own.cell(name, at, group, rows)
+            for name, by_training in trained.items()
+            for at, own in by_training.items()
+            for group, rows in groups.items()
+        ),
+        trained_mm={(n, at): o.errors_mm for n, own in trained.items() for at, o in own.items() if at},
         warnings=_warnings(ready, variants),
         seconds=watch.seconds,
         provenance=first.provenance(dataset),
@@ -519,41 +524,28 @@ def _nested(
 @dataclass(frozen=True)
 class _Trained:
     errors_mm: Array  # by record
-    turns_deg: Array
+    turns_deg: Array | None
     failed_fits: int
 
+    def cell(self, variant: str, trained_at: tuple[str, ...], group: str, rows: Indices) -> Cell:
+        turns = None if self.turns_deg is None else summarise(self.turns_deg[rows])
+        errors, crossed = summarise(self.errors_mm[rows]), group in trained_at
+        return Cell(variant, trained_at, group, errors, crossed, self.failed_fits, turns)
 
-def _by_training(fits: Sequence[JudgedFit], trainings: Sequence[_Training]) -> dict[tuple[str, ...], _Trained]:
-    """What each training of a variant says of every record: group by group, then all together."""
-    trained, at = {}, 0
+
+def _by_training(
+    ready: Prepared, fits: Sequence[JudgedFit], trainings: Sequence[_Training]
+) -> dict[tuple[str, ...], _Trained]:
+    """What a variant says of every record without calibration, then by each training: group by group, then all."""
+    nominal, turned = _nominal(ready)
+    trained, at = list[tuple[tuple[str, ...], _Trained]](), 0
     for training in trainings:
         own = fits[at : at + len(training.splits)]
         errors, _, turns = training.errors(own)
-        trained[training.groups] = _Trained(errors, turns, sum(not fit.converged for fit in own))
+        failed = sum(not fit.converged for fit in own)
+        trained.append((training.groups, _Trained(errors, None if turned is None else turns, failed)))
         at += len(own)
-    return dict([*list(trained.items())[1:], next(iter(trained.items()))])
-
-
-def _cells(
-    name: str, ready: Prepared, trained: Mapping[tuple[str, ...], _Trained], groups: Mapping[str, Indices]
-) -> list[Cell]:
-    """Without calibration, then by what was trained at, group by group."""
-    nominal, turned = _nominal(ready)
-    before = np.full(len(nominal), np.nan) if turned is None else turned
-    rows = {(): _Trained(nominal, before, 0), **trained}
-    return [
-        Cell(
-            name,
-            at,
-            group,
-            summarise(own.errors_mm[members]),
-            group in at,
-            own.failed_fits,
-            None if turned is None else summarise(own.turns_deg[members]),
-        )
-        for at, own in rows.items()
-        for group, members in groups.items()
-    ]
+    return dict([((), _Trained(nominal, turned, 0)), *trained[1:], trained[0]])
 
 
 def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) -> tuple[str, ...]:
@@ -570,16 +562,7 @@ def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) 
 
 
 def files(result: StudyResult, study: ConfigSource, variants: Mapping[str, ConfigSource], page: str) -> dict[str, str]:
-    return {
-        "experiment.yaml": dump(_self_contained(study, variants)),
-        "study.csv": _csv_text(result),
-        "study.json": as_json(result.as_dict()) + "\n",
-        "study.html": page,
-    }
-
-
-def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -> dict[str, Any]:
-    """The configuration with each variant as the sections in which it differs: no other file is needed."""
+    """The configuration with each variant as the sections in which it differs: no other file is needed; and results."""
     read = next((own.data["data"] for own in variants.values() if "data" in own.data), None)
     data = study.data if read is None else {**study.data, "data": read}
     base = {key: section for key, section in data.items() if key != VARIANTS[0]}
@@ -587,11 +570,7 @@ def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -
     for name, own in variants.items():
         differing = {key: section for key, section in own.data.items() if base.get(key) != section}
         listed[name] = {"set": differing | {key: None for key in base if key not in own.data}}
-    return {**data, VARIANTS[0]: {**data[VARIANTS[0]], "variants": listed}}
-
-
-def _csv_text(result: StudyResult) -> str:
-    """A row a record, an error a variant, by a fit that did not see the record."""
+    # A row a record, an error a variant, by a fit that did not see the record.
     columns: dict[str, Any] = {} if result.group_by is None else {result.group_by: result.labels}
     columns |= {f"{v.name}_{result.unit}": v.errors_mm for v in result.variants}
     if result.nested:
@@ -600,9 +579,13 @@ def _csv_text(result: StudyResult) -> str:
         if len(trained) < len(result.groups):
             columns[f"{name}_trained_at_{'_and_'.join(trained).replace(' ', '_')}_{result.unit}"] = errors
     dataset = result.dataset
-    rows = dataset.rows or ("",) * len(dataset)
-    body = zip(dataset.ids, rows, *columns.values(), strict=True)
-    return csv_text([["pose_id", "source_row", *columns], *body])
+    body = zip(dataset.ids, dataset.rows or ("",) * len(dataset), *columns.values(), strict=True)
+    return {
+        "experiment.yaml": dump({**data, VARIANTS[0]: {**data[VARIANTS[0]], "variants": listed}}),
+        "study.csv": csv_text([["pose_id", "source_row", *columns], *body]),
+        "study.json": as_json(result.as_dict()) + "\n",
+        "study.html": page,
+    }
 
 
 _FOLDS = 5
