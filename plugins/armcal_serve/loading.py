@@ -113,7 +113,7 @@ class Loader:
         """Made of what was compiled for the calibration before, where it can be."""
         if self.within and name not in self._options:
             from armcal.plugins import discover  # late: not needed without limits
-            from armcal.run.plan_poses import options_within
+            from armcal.run.plan import options_within
 
             joints = tuple(calibration.system.arms[name].commanded)
             self._options[name] = options_within(Path(self.within), joints, discover())

@@ -247,12 +247,6 @@ def test_a_run_leaves_the_bootstrap_beside_the_curvature(tmp_path: Path) -> None
     by_curvature = {p["name"]: p for p in yaml.safe_load((out / "calibration.yaml").read_text())["parameters"]}
     for name, own in told["parameters"].items():
         assert own["lower"] < by_curvature[name]["value"] + 8 * by_curvature[name]["sd"] and own["lower"] < own["upper"]
-    (out / "bootstrap.csv").write_text("of an earlier version\n")
-    again = CliRunner().invoke(
-        cli, ["run", DEMO, "--out", str(out), "-q", "--set", FREE, "--set", "validation.folds=0", "--accept"]
-    )
-    assert again.exit_code == 0 and not (out / "bootstrap.csv").exists(), "one of an earlier run was left beside"
-    assert (out / "earlier" / "1" / "bootstrap.csv").is_file()
 
 
 @pytest.mark.parametrize("setting", ["bootstrap=-1", "bootstrap=2.5", "blocks=0", "blocks=many", "profile=[x]"])

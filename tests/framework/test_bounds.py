@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.calibration.calibration_file import parameter_records
-from armcal.cli.console import Screen
+from armcal.cli.common import Screen
 from armcal.diagnose.verdict import shifts
 from armcal.estimate.estimator import Estimate, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels

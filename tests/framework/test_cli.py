@@ -17,7 +17,7 @@ import forked
 import numpy as np
 import pytest
 import yaml
-from armcal.cli.console import Screen
+from armcal.cli.common import Screen
 from armcal.cli.main import cli
 from click.testing import CliRunner, Result
 from rich.table import Table

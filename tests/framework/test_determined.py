@@ -12,8 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from armcal import Calibration
-from armcal.calibration.calibration_file import sealed
 from armcal.cli.main import cli
 from armcal.diagnose.gross import displaced
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
@@ -116,22 +114,6 @@ def test_an_interval_at_a_bound_is_the_same_in_terminal_report_and_calibration(t
     (row,) = (line for line in ran.stdout.splitlines() if line.startswith(" arm.spring.k6 "))
     page = html.unescape((tmp_path / "run" / "report.html").read_text())
     assert words in row and "at its bound" in row and words in page
-
-
-@pytest.mark.filterwarnings("ignore::armcal.errors.CalibrationWarning")
-def test_calibrations_of_earlier_versions_say_the_same(tmp_path: Path) -> None:
-    settings = (*QUICK, "parameters.free=[arm.mdh.theta2, arm.mdh.base_z]", "parameters.priors={arm.mdh.base_z: 1 um}")
-    assert armcal("run", DEMO, "--accept", "--out", tmp_path / "run", settings=settings).exit_code == 0
-    path = tmp_path / "run" / "calibration.yaml"
-    content, now = yaml.safe_load(path.read_text()), Calibration.load(path).record.parameters
-    for entry in content["parameters"]:
-        by = entry.pop("determined_by")
-        entry["determined"] = None if by is None else by == "data"
-        entry["held_by_prior"] = by == "prior"
-    path.write_text(sealed(content))
-    assert Calibration.load(path).record.parameters == now
-    by = {entry.name: entry.determined_by for entry in now if entry.free}
-    assert by == {"arm.mdh.theta2": "data", "arm.mdh.base_z": "prior"}
 
 
 @pytest.mark.parametrize(("sd", "expected"), [(0.2, True), (0.02, False)])

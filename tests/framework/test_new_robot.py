@@ -16,7 +16,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.calibration.convert import difference, load_source, nominal_values
 from armcal.calibration.rigid_chain import numeric_chain, tool_poses
 from armcal.cli.main import cli
-from armcal.cli.new_robot import direction, place
+from armcal.cli.new import direction, place
 from armcal.config.yaml_source import word
 from armcal.errors import InputError
 from armcal.plugins import discover

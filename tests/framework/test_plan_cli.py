@@ -13,7 +13,7 @@ from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, clearance_check
-from armcal.run.plan_poses import JointSpace, spread
+from armcal.run.plan import JointSpace, spread
 from click.testing import CliRunner, Result
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

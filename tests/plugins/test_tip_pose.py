@@ -12,8 +12,7 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment, PlanSettings
 from armcal.run.pipeline import calibrate
-from armcal.run.plan import PlanContext
-from armcal.run.plan_poses import JointSpace
+from armcal.run.plan import JointSpace, PlanContext
 from armcal_tracker.position import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation

@@ -21,7 +21,7 @@ from armcal.measure.checks import layout_of, refuse_joint_units, warn_beyond_lim
 from armcal.measure.reader import requested_channels
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
-from armcal.run.plan_poses import stated_beyond
+from armcal.run.plan import stated_beyond
 from armcal_joints.effects import ServoMap
 from armcal_urdf.model import UrdfModel, UrdfSettings
 from armcal_urdf.robot import MAX_BYTES, decode, encode

@@ -57,17 +57,11 @@ _OTHER_PHYSICS = (
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated arm.
+    """A calibrated arm."""
 
-    Attributes:
-        system: arms, measurements and statics.
-        parameters: all blocks; their nominal values are the calibrated ones.
-        record: the file's content.
-    """
-
-    system: System
-    parameters: Parameters
-    record: CalibrationFile
+    system: System  # arms, measurements and statics
+    parameters: Parameters  # all blocks; their nominal values are the calibrated ones
+    record: CalibrationFile  # the file's content
 
     @classmethod
     def load(
@@ -97,12 +91,7 @@ class Calibration:
 
     @classmethod
     def built(cls, source: ConfigSource, path: str | Path, registry: PluginRegistry) -> Self:
-        """The calibration in a file that was read, whatever its predictions were when it was written.
-
-        Raises:
-            ConfigError: its parts do not fit one another.
-            PluginError: it needs a plugin that is not there.
-        """
+        """The calibration in a file that was read, whatever its predictions were when it was written."""
         where, record = Location(str(path)), validate(CalibrationFile, source)
         if not record.converged:
             hint = "Run the calibration again with better start values or more data."
@@ -121,15 +110,19 @@ class Calibration:
         require_present(record.components, registry, where)
         system = build_system(source, registry)
         parameters = system.parameters(record.groups)
-        changed = differences(record.components, components(system, registry))
-        return cls(system, parameters.with_nominal(_values(parameters, record, path, changed)), record)
+        values = {entry.name: entry.value for entry in record.parameters}
+        if tuple(values) != parameters.entry_names:
+            differing = ", ".join(sorted(set(values) ^ set(parameters.entry_names))[:5]) or "their order differs"
+            changed = "; ".join(differences(record.components, components(system, registry)))
+            raise ConfigError(
+                f"its parameters are not those of its arm: {differing}.",
+                where=where,
+                hint=f"It was made with {changed or 'another version of a plugin'}; run the calibration again.",
+            )
+        return cls(system, parameters.with_nominal(np.array(list(values.values()))), record)
 
     def checked(self, commands: Dataset | None, registry: PluginRegistry) -> Self:
-        """The same with what its components are now and predictions at check poses (no poses: none).
-
-        Raises:
-            NotConvergedError: a pose has no equilibrium.
-        """
+        """The same with what its components are now and predictions at check poses (no poses: none)."""
         checks = None
         if commands is not None:
             stated = self.plus_minus(commands) if self.record.prediction and self.readable else None
@@ -201,14 +194,9 @@ class Calibration:
         return predict(self.system, self.parameters, commands)
 
     def require_payload(self, stated: bool, source: str | None = None) -> None:
-        """An arm that is elastic, or has learned of loads, needs to know its own: from calibration or records.
-
-        Raises:
-            DataError: neither says.
-        """
+        """A DataError where neither calibration nor records state the payload of an arm whose place depends on it."""
         arms = self.system.arms.values()
-        moved = any(arm.depends_on_payload for arm in arms)
-        if moved and self.system.statics.payload is None and not stated:
+        if any(arm.depends_on_payload for arm in arms) and self.system.statics.payload is None and not stated:
             elastic = any(arm.deflection_size for arm in arms)
             raise DataError(
                 f"the arm {'is elastic' if elastic else 'has learned what loads do'} and its payload is not stated.",
@@ -243,24 +231,15 @@ class Calibration:
             )
         fitted = self.nominal.with_free(self.free)
         try:
-            nan = float("nan")  # where null is kept
-            stated: list[dict[str, Any]] = [
-                {key: nan if value is None else value for key, value in component.items()}
-                for component in noise.get("components", ())
-            ]
-            components = tuple(Component(**component) for component in stated)
+            listed: list[dict[str, Any]] = noise.get("components", [])
+            stated: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in own.items()} for own in listed]
+            components = tuple(Component(**own) for own in stated)
             measure = (float(noise["scale"]), float(noise["degrees_of_freedom"]))
         except (KeyError, TypeError, ValueError) as fault:
             text = f"the noise in the calibration cannot be read ({type(fault).__name__}: {fault})."
             raise ConfigError(text, hint="The file was edited or damaged; run the calibration again.") from fault
-        return Uncertainty(
-            replace(self.system, measurements=self.readable),
-            fitted,
-            self.parameters.nominal(),
-            kept,
-            *measure,
-            components,
-        )
+        system = replace(self.system, measurements=self.readable)
+        return Uncertainty(system, fitted, self.parameters.nominal(), kept, *measure, components)
 
     def plus_minus(self, commands: Dataset) -> PlusMinus:
         """How far measurements at these commands may lie from ``predict``.
@@ -381,33 +360,30 @@ def arm_named(arms: Collection[str], arm: str | None, where: Location | None = N
     return name
 
 
-def _values(parameters: Parameters, record: CalibrationFile, path: str | Path, changed: Sequence[str]) -> Array:
-    kept = {entry.name: entry.value for entry in record.parameters}
-    if tuple(kept) != parameters.entry_names:
-        differing: Sequence[str] = sorted(set(kept) ^ set(parameters.entry_names))
-        raise ConfigError(
-            f"its parameters are not those of its arm: {', '.join(differing[:5]) or 'their order differs'}.",
-            where=Location(str(path)),
-            hint=f"It was made with {'; '.join(changed) or 'another version of a plugin'}; run the calibration again.",
-        )
-    return np.array(list(kept.values()))
-
-
 def accept(path: Path, day: str, registry: PluginRegistry) -> tuple[Calibration | None, bool, float | None]:
     """Check a calibration again in all but its hash, as of a day.
 
-    Returns:
-        it with a note of its acceptance and predictions at its check poses as they are now, None where it is as armcal
-        wrote it, with the same versions; whether its content was edited; and how far tools at its check poses are from
-        where they were predicted (m), None if it keeps none.
-
-    Raises:
-        ConfigError: it is no calibration, its parts do not fit one another, or a value is outside of its interval.
-        PluginError: it needs a plugin that is not there.
+    Gives it with a note of its acceptance and predictions at its check poses as they are now, None where it is as
+    armcal wrote it, with the same versions; whether its content was edited; and how far tools at its check poses are
+    from where they were predicted (m), None if it keeps none.
     """
     source, is_whole = read_record(path, changed=True)
     loaded, where = Calibration.built(source, path, registry), Location(str(path))
-    _check_values(loaded.record, source)
+    for index, entry in enumerate(loaded.record.parameters):
+        stands = source.where(("parameters", index, "value"))
+        low, high = (-np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper)
+        if entry.free and not low <= entry.value <= high:
+            raise ConfigError(
+                f"{entry.name} is {entry.value:g} {entry.unit}, expected {low:g} to {high:g}, its own lower and upper.",
+                where=stands,
+                hint="Correct the value, or widen the interval if you know better.",
+            )
+        if not entry.free and entry.value != entry.nominal:
+            raise ConfigError(
+                f"{entry.name} is fixed at {entry.nominal:g} {entry.unit}, and its value is {entry.value:g}.",
+                where=stands,
+                hint="Write the same number for nominal and value.",
+            )
     how = "made with other versions" if is_whole else "edited by hand"
     noted = replace(loaded, record=loaded.record.model_copy(update={"accepted": f"{how} and accepted on {day}"}))
     try:
@@ -422,25 +398,6 @@ def accept(path: Path, day: str, registry: PluginRegistry) -> tuple[Calibration 
         raise ConfigError(text, where=where, hint="Undo the last edits, or run the calibration again.") from fault
     same = remade.record.model_copy(update={"accepted": loaded.record.accepted}) == loaded.record
     return None if is_whole and same else remade, not is_whole, moved
-
-
-def _check_values(record: CalibrationFile, source: ConfigSource) -> None:
-    """Each value lies in its interval, and a fixed one is its nominal value."""
-    for index, entry in enumerate(record.parameters):
-        where = source.where(("parameters", index, "value"))
-        low, high = (-np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper)
-        if entry.free and not low <= entry.value <= high:
-            raise ConfigError(
-                f"{entry.name} is {entry.value:g} {entry.unit}, expected {low:g} to {high:g}, its own lower and upper.",
-                where=where,
-                hint="Correct the value, or widen the interval if you know better.",
-            )
-        if not entry.free and entry.value != entry.nominal:
-            raise ConfigError(
-                f"{entry.name} is fixed at {entry.nominal:g} {entry.unit}, and its value is {entry.value:g}.",
-                where=where,
-                hint="Write the same number for nominal and value.",
-            )
 
 
 _MODEL_ZERO = re.compile(r"(theta|offset)(\d+)")

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armcal import plugins
 from armcal.arm import assembly
@@ -69,17 +69,6 @@ class ParameterRecord(Settings):
     determined_by: DeterminedBy | None = None
     at_bound: bool = False
     unconstrained: float | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _as_before(cls, record: Any) -> Any:
-        """Earlier versions wrote two fields: whether the data determine it, and whether a prior holds it."""
-        if isinstance(record, dict) and "determined" in record:
-            by_data, by_prior = record["determined"], record.get("held_by_prior")
-            by = None if by_data is None else "data" if by_data else "prior" if by_prior else "nothing"
-            record = {k: v for k, v in record.items() if k not in ("determined", "held_by_prior")}
-            record["determined_by"] = by
-        return record
 
 
 class InformationRecord(Settings):

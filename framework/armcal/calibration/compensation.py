@@ -53,24 +53,13 @@ _ORTHOGONAL = 1e-6
 
 @dataclass(frozen=True)
 class Targets:
-    """Where the tool shall be.
+    """Where the tool shall be; a ValueError for arrays of other shapes, or matrices that are no rotations."""
 
-    Attributes:
-        positions: of the tool's origin in the base frame (N x 3; m).
-        rotations: base_R_tool (N x 3 x 3); None where only positions count.
-        acting: what acts on the arm (LOAD_CHANNELS x N; SI, base frame).
-        approach: from where each joint comes (n x N; -1, 0, 1; 0: not known).
-        conditions: of the surroundings, by name (N each).
-
-    Raises:
-        ValueError: arrays of other shapes, numbers that are none, or matrices that are no rotations.
-    """
-
-    positions: Array
-    rotations: Array | None
-    acting: Array
-    approach: Array
-    conditions: Mapping[str, Array] = field(default_factory=dict)
+    positions: Array  # of the tool's origin in the base frame (N x 3; m)
+    rotations: Array | None  # base_R_tool (N x 3 x 3); None where only positions count
+    acting: Array  # what acts on the arm (LOAD_CHANNELS x N; SI, base frame)
+    approach: Array  # from where each joint comes (n x N; -1, 0, 1; 0: not known)
+    conditions: Mapping[str, Array] = field(default_factory=dict)  # of the surroundings, by name (N each)
 
     def __post_init__(self) -> None:
         count = len(self.positions)
@@ -112,36 +101,20 @@ class Targets:
 
 @dataclass(frozen=True)
 class Commands:
-    """What to command, and where that leads.
+    """What to command, and where that leads."""
 
-    Attributes:
-        joints: the commanded joints (n).
-        joint_angles: what to command (N x n; rad, or m on sliding joints); of a target that cannot be reached, the
-            nearest that was found.
-        counts: of a servo board, to command (N x n; 0 of joints without a pulse table); None for an arm without one.
-        base_T_tool: where the calibrated arm's tool then is (N x 4 x 4), quantisation and elasticity included.
-        base_T_point: and the point that is brought to targets: the tool itself, or the target that was measured.
-        distances: from that point to the target (N; m).
-        turns: from its rotation to the target's (N; rad); zeros where only positions count.
-        reached: whether the target is reached, up to what the counts leave (N).
-        reasons: why not; empty for those that are reached (N).
-        bounds: no command brings the arm nearer than this (N; m); zero where nothing is known.
-        moves: along a path, of each joint from the target before (N x n; rad or m); None for single targets.
-        approach: from where each joint comes (N x n; -1, 0, 1), as far as that was stated or follows from the path.
-    """
-
-    joints: tuple[str, ...]
-    joint_angles: Array
-    counts: NDArray[np.int64] | None
-    base_T_tool: Array
-    base_T_point: Array
-    distances: Array
-    turns: Array
-    reached: Mask
-    reasons: tuple[str, ...]
-    bounds: Array
-    approach: Array
-    moves: Array | None = None
+    joints: tuple[str, ...]  # the commanded joints (n)
+    joint_angles: Array  # N x n (rad, or m on sliding joints); of a target that is not reached, the nearest found
+    counts: NDArray[np.int64] | None  # of a servo board, to command (N x n; 0 of joints without a pulse table)
+    base_T_tool: Array  # where the calibrated arm's tool then is (N x 4 x 4), quantisation and elasticity included
+    base_T_point: Array  # and the point that is brought to targets: the tool itself, or the target that was measured
+    distances: Array  # from that point to the target (N; m)
+    turns: Array  # from its rotation to the target's (N; rad); zeros where only positions count
+    reached: Mask  # whether the target is reached, up to what the counts leave (N)
+    reasons: tuple[str, ...]  # why not; empty for those that are reached (N)
+    bounds: Array  # no command brings the arm nearer than this (N; m); zero where nothing is known
+    approach: Array  # from where each joint comes (N x n; -1, 0, 1), as far as that was stated or follows from the path
+    moves: Array | None = None  # along a path, of each joint from the target before (N x n; rad or m)
 
     def __len__(self) -> int:
         return len(self.joint_angles)
@@ -149,33 +122,21 @@ class Commands:
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Those of several parts of the targets, one after another."""
-        columns: dict[str, Any] = {
-            part.name: [getattr(commands, part.name) for commands in parts] for part in fields(cls)
-        }
-        whole: dict[str, Any] = {
-            name: None if column[0] is None else np.concatenate(column) for name, column in columns.items()
-        }
+        columns = {own.name: [getattr(part, own.name) for part in parts] for own in fields(cls)}
+        whole: dict[str, Any] = {n: None if own[0] is None else np.concatenate(own) for n, own in columns.items()}
         whole["joints"], whole["reasons"] = parts[0].joints, tuple(why for part in parts for why in part.reasons)
         return cls(**whole)
 
 
 @dataclass(frozen=True)
 class Options:
-    """How commands are chosen.
+    """How commands are chosen."""
 
-    Attributes:
-        limits: lowest and highest command by joint (rad or m), instead of the model's.
-        reach_m: targets of this size count as had (m).
-        reach_rad: and of this size of turn (rad).
-        seed: of the random starts.
-        allowed: from commands (n x N) to whether the arm may be there (N); None where it may be anywhere.
-    """
-
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    reach_m: float = 1e-9
-    reach_rad: float = 1e-8
-    seed: int = 0
-    allowed: Allowed | None = None
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by joint (rad or m), not the model's
+    reach_m: float = 1e-9  # targets of this size count as had (m)
+    reach_rad: float = 1e-8  # and of this size of turn (rad)
+    seed: int = 0  # of the random starts
+    allowed: Allowed | None = None  # from commands (n x N) to whether the arm may be there (N)
 
 
 def _check(what: str, array: Array, shape: tuple[int, ...]) -> None:
@@ -186,10 +147,9 @@ def _check(what: str, array: Array, shape: tuple[int, ...]) -> None:
 
 
 def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> Array:
-    """Lowest and highest command of each joint (n x 2; rad or m), infinite where nothing limits it.
+    """Lowest and highest command of each joint (n x 2; rad or m): stated ones, the model's, else infinite.
 
-    ``stated`` take the place of the model's. A servo's pulse table is known between its ends only, so a joint with one
-    stays between them too.
+    A servo's pulse table is known between its ends only, so a joint with one stays between them too.
     """
     known = joint_limits(expression.arm.nominal_chain, stated)
     limits = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
@@ -208,15 +168,12 @@ class Reach:
 
     A joint turns about its frame's origin, and so do its springs: the distance of two joints' origins next to each
     other never changes, whatever is commanded and whatever gives. A point beyond the sum of all of them, or nearer than
-    the longest exceeds the others, is out of reach.
-
-    Attributes:
-        farthest: m; infinite where nothing is known, as of arms whose joints turn about axes beside their frames, or
-            whose lengths change with the surroundings.
+    the longest exceeds the others, is out of reach. Nothing is known of arms whose joints turn about axes beside their
+    frames, or whose lengths change with the surroundings.
     """
 
     centre: Array  # the mount's origin (m; base frame)
-    farthest: float
+    farthest: float  # m; infinite where nothing is known
     nearest: float  # m
 
     def bounds(self, positions: Array) -> Array:
@@ -226,10 +183,7 @@ class Reach:
 
 
 def reach_of(arm: Arm, parameters: Parameters, limits: Array, tool_T_point: Transform | None = None) -> Reach:
-    """What an arm reaches at most, with the values of ``parameters``; limits (n x 2) of the commanded joints.
-
-    It is reached with the tool's origin, or with another point of the tool.
-    """
+    """What an arm reaches at most with the tool's origin or another point of it; ``limits`` of commands (n x 2)."""
     values = {block.name: ca.SX(list(block.nominal)) for block in parameters.blocks if not block.nuisance}
     chain = arm.chain(values)
     centre = evaluated(chain.base_T_mount.translation).ravel()
@@ -265,14 +219,9 @@ def sides_of(moved: Array, before: Array) -> Array:
 def with_sides(record: Array, at: Array, before: Array, search: Callable[[Array], Solutions]) -> Solutions:
     """Commands found under the sides from which they make the joints come; these are left in the record.
 
-    A joint that comes from the one side only if commanded from the other has no side: it gets 0, and its play
-    counts as uncertainty.
-
-    Args:
-        record: channels x N; the joints' commands and then their sides stand first.
-        at: commands from which the joints come (n x N).
-        before: the sides from which they came there (n x N).
-        search: from a record to commands.
+    ``at`` are the commands from which the joints come, ``before`` the sides from which they came there (n x N each). A
+    joint that comes from the one side only if commanded from the other has no side: it gets 0, and its play counts as
+    uncertainty.
     """
     place = slice(len(at), 2 * len(at))
     record[place] = before
@@ -343,16 +292,10 @@ class ServoCounts:
         return counts, angles
 
     def best(self, near: tuple[Counts, Array], commands: Array, slopes: Array, left: Array) -> tuple[Counts, Array]:
-        """The combinations with the least error to first order.
+        """The combinations with the least error to first order: counts and angles (n x N x TRIED), the best first.
 
-        Args:
-            near: what can be set about the commands, as ``near`` has it.
-            commands: the exact ones (n x N).
-            slopes: of the tool, its weighted rows (N x m x n).
-            left: what the exact commands leave (m x N).
-
-        Returns:
-            counts and angles (n x N x TRIED), the best first.
+        ``near`` is what can be set about the exact ``commands`` (n x N), ``slopes`` are the weighted rows of the tool
+        (N x m x n), and ``left`` is what the exact commands leave (m x N).
         """
         counts, angles = near
         moved = (angles - commands[:, None, :]).transpose(2, 0, 1)
@@ -403,19 +346,14 @@ class Rounding:
     solver: Solver
 
     def __call__(
-        self, record: Array, solutions: Solutions, target: Array, allowed: Allowed | None
-    ) -> tuple[Counts, Array]:
-        """Counts and what they make (n x N each) for records with the exact commands, and targets (3 or 12 x N)."""
-        counts, commands = np.zeros(solutions.commands.shape, dtype=np.int64), np.zeros_like(solutions.commands)
-        for start in range(0, record.shape[1], _ROUNDED_AT_ONCE):
-            part = slice(start, start + _ROUNDED_AT_ONCE)
-            some = solutions.commands[:, part], solutions.states[:, part], target[:, part]
-            counts[:, part], commands[:, part] = self._part(record[:, part], *some, allowed)
-        return counts, commands
-
-    def _part(
         self, record: Array, exact: Array, states: Array, target: Array, allowed: Allowed | None
     ) -> tuple[Counts, Array]:
+        """Counts and what they make (n x N each) for records with the exact commands, and targets (3 or 12 x N)."""
+        if record.shape[1] > _ROUNDED_AT_ONCE:
+            starts = range(0, record.shape[1], _ROUNDED_AT_ONCE)
+            columns = [slice(start, start + _ROUNDED_AT_ONCE) for start in starts]
+            parts = [self(record[:, s], exact[:, s], states[:, s], target[:, s], allowed) for s in columns]
+            return np.hstack([counts for counts, _ in parts]), np.hstack([commands for _, commands in parts])
         joints, count = exact.shape
         left = _left(self.equilibrium(record, states).base_T_tool, target)
         weights = np.array([1.0] * 3 + [self.solver.length] * (len(left) - 3))[:, None]
@@ -449,11 +387,7 @@ PART = 8  # Targets that a request of many is answered by at a time
 class Compensator:
     """From targets to commands for one calibrated arm; built once, asked often.
 
-    Attributes:
-        expression: the arm's.
-        options: how commands are chosen.
-        limits: lowest and highest command by joint (n x 2; rad or m).
-        reach: how far it reaches at all.
+    ``limits`` are the lowest and highest command by joint (n x 2; rad or m), ``reach`` how far it reaches at all.
     """
 
     def __init__(
@@ -463,13 +397,7 @@ class Compensator:
         options: Options | None = None,
         choice: EvaluatorChoice = "auto",
     ) -> None:
-        """Build it.
-
-        Args:
-            expression: the calibrated arm's.
-            parameters: its calibrated values.
-            options: how commands are chosen.
-            choice: of evaluator: compiled C, or CasADi's interpreter.
+        """Of a calibrated arm and its values, by compiled C or CasADi's interpreter.
 
         Raises:
             ValueError: limits of a joint that is not there, or in falling order.
@@ -528,15 +456,9 @@ class Compensator:
         return Targets(positions, turned, acting, sides, columns)
 
     def solve(self, targets: Targets, start: Array | None = None) -> Commands:
-        """Commands for each target by itself.
+        """Commands for each target by itself: those nearest to ``start``, else the first that are found.
 
-        Args:
-            targets: where the tool shall be.
-            start: commands from which the arm comes (n or N x n). ``nearest`` is near to them; without any the first
-                commands that are found are taken.
-
-        Raises:
-            ValueError: another number of commands.
+        ``start`` are commands from which the arm comes (n or N x n); a ValueError for another number of them.
         """
         record = self._record(targets)
         towards = None if start is None else self._commanded(start, len(targets))
@@ -556,20 +478,13 @@ class Compensator:
 
         ``start`` (n) is where the arm stands; without it the best of several postures for the first target. The sides
         from which joints come follow from the path.
-
-        Raises:
-            ValueError: as of ``solve``.
         """
         if not len(targets):
             return replace(self.solve(targets, start), moves=np.zeros((0, len(self.joints))))
         return Commands.joined([part for part in self.following(targets, start) if part is not None])
 
     def following(self, targets: Targets, start: Array | None = None) -> Iterator[Commands | None]:
-        """The same a little at a time, for a server with other clients: None while it searches, then part by part.
-
-        Raises:
-            ValueError: as of ``solve``.
-        """
+        """The same a little at a time, for a server with other clients: None while it searches, then part by part."""
         record, goal, finder = self._record(targets), _goal(targets), self._finder(targets)
         if start is None:
             at = finder.postures(record[:, :1], goal[:, :1], _STARTS)[0]
@@ -581,12 +496,15 @@ class Compensator:
         side, spoilt = np.zeros_like(at), np.zeros(wide, dtype=int)
         for i in range(count):
             rows = np.full(wide, i)
-            if i == 0 and start is None:
-                steps.append(finder.onward(record[:, rows], goal[:, rows], at))
+            here, target = record[:, rows], goal[:, rows]
+            if (i == 0 and start is None) or not self._tells_approach:
+                steps.append(finder.onward(here, target, at))
             else:
-                solutions, side = self._next(finder, record[:, rows], goal[:, rows], at, side)
-                steps.append(solutions)
-                moves[i], sides[i] = solutions.commands - at, side
+                steps.append(with_sides(here, at, side, partial(finder.onward, target=target, at=at)))
+            if i or start is not None:
+                moves[i] = steps[-1].commands - at
+                side = here[len(at) : 2 * len(at)] if self._tells_approach else sides_of(moves[i], side)
+                sides[i] = side
             at = steps[-1].commands
             spoilt += (np.abs(moves[i]).max(axis=0) > _JUMP).astype(int) + ~steps[-1].there
             kept = np.asarray(spoilt == spoilt.min())
@@ -604,15 +522,6 @@ class Compensator:
             part = self._commands(chosen_of(record, rows), targets.subset(rows), along)
             yield replace(part, moves=moves[rows, :, best])
 
-    def _next(self, finder: Finder, record: Array, goal: Array, at: Array, side: Array) -> tuple[Solutions, Array]:
-        """A step along a path from commands to which joints came from sides (n x N each)."""
-        if not self._tells_approach:
-            solutions = finder.onward(record, goal, at)
-            return solutions, sides_of(solutions.commands - at, side)
-        record = record.copy()
-        solutions = with_sides(record, at, side, lambda sided: finder.onward(sided, goal, at))
-        return solutions, record[len(at) : 2 * len(at)]
-
     def onward(self, targets: Targets, at: Array) -> Commands:
         """Commands for targets straight on from others (N x n): no other posture is looked for."""
         record = self._record(targets)
@@ -629,10 +538,7 @@ class Compensator:
         """Where the point that is brought to targets is (N x 4 x 4) at commands (N x n) as they are, in equilibrium.
 
         ``acting`` is LOAD_CHANNELS x N, the calibration's without it; ``approach`` N x n; ``conditions`` as of targets.
-
-        Raises:
-            ValueError: another number of commands, or of conditions.
-            NotConvergedError: one has no equilibrium.
+        A NotConvergedError if one has no equilibrium.
         """
         count = len(np.atleast_2d(joint_angles))
         commands = self._commanded(joint_angles, count)
@@ -666,7 +572,6 @@ class Compensator:
         return self._counts.angles(self._counts.counts(commands), commands)
 
     def _found(self, record: Array, targets: Targets, start: Array | None) -> Solutions:
-        """Exact commands: the nearest to those from which the arm comes, or the first that are found."""
         finder = self._finder(targets)
         return finder.first(record, _goal(targets)) if start is None else finder.onward(record, _goal(targets), start)
 
@@ -676,7 +581,8 @@ class Compensator:
         record[:joints] = solutions.commands
         rounding = self._kind("position" if targets.rotations is None else "pose")[1]
         if rounding is not None:
-            counts, record[:joints] = rounding(record, solutions, _goal(targets), self._allowed)
+            exact = solutions.commands, solutions.states
+            counts, record[:joints] = rounding(record, *exact, _goal(targets), self._allowed)
             if self._allowed is not None:
                 barred = solutions.there & ~self._allowed(record[:joints])
                 solutions.there[barred], solutions.forbidden[barred] = False, True

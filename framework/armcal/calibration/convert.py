@@ -24,7 +24,6 @@ from armcal.base.quaternions import quaternion_of, rpy_of
 from armcal.calibration.calibration import Calibration, arm_named
 from armcal.calibration.rigid_chain import (
     RigidChain,
-    RigidJoint,
     largest_difference,
     numeric_chain,
     random_commands,
@@ -45,8 +44,6 @@ _SAME_MOUNT = 1e-9
 
 @dataclass(frozen=True)
 class ConvertSource:
-    """What is converted."""
-
     arm: str  # the arm's instance name
     chain: Chain  # of constants: nominal ones of a configuration, calibrated ones of a calibration
     left: tuple[str, ...]  # what of the file belongs to the arm and is not in the chain, in words
@@ -54,10 +51,7 @@ class ConvertSource:
 
 @dataclass(frozen=True)
 class Difference:
-    """Between two chains: the largest distance (m) and angle (rad) over random poses, and how many these were.
-
-    ``same_mount`` says whether their mounts are the same too.
-    """
+    """Between two chains, the largest over random poses."""
 
     position_m: float
     angle_rad: float
@@ -68,7 +62,13 @@ class Difference:
 def load_source(path: str | Path, arm: str | None, registry: PluginRegistry) -> ConvertSource:
     """The chain of an arm of a configuration or a calibration."""
     source = load_config(path)
-    name = _named(source, arm)
+    arms = source.data.get("arms")
+    if not isinstance(arms, dict) or not arms:
+        hint = "Give a configuration or a calibration.yaml."
+        raise ConfigError("found no arms.", where=Location(str(source.path)), hint=hint)
+    name = arm_named([str(own) for own in arms], arm, source.where(("arms",)))
+    if not isinstance(arms[name], dict) or "model" not in arms[name]:
+        source.refuse(("arms", name), f"the arm {name!r} has no model.", "Write model: {type: NAME, ...}.")
     if "armcal_calibration" in source.data:
         loaded = Calibration.load(path, registry)
         source_arm = loaded.system.arms[name]
@@ -97,18 +97,6 @@ def difference(one: Chain, two: Chain) -> Difference:
     commands = random_commands(known, POSES, _SEED)
     same_mount = bool(np.abs(known.base_T_mount - rigid_chain(two).base_T_mount).max() < _SAME_MOUNT)
     return Difference(*largest_difference(tool_poses(one, commands), tool_poses(two, commands)), POSES, same_mount)
-
-
-def _named(source: ConfigSource, arm: str | None) -> str:
-    arms = source.data.get("arms")
-    if not isinstance(arms, dict) or not arms:
-        raise ConfigError(
-            "found no arms.", where=Location(str(source.path)), hint="Give a configuration or a calibration.yaml."
-        )
-    name = arm_named([str(own) for own in arms], arm, source.where(("arms",)))
-    if not isinstance(arms[name], dict) or "model" not in arms[name]:
-        source.refuse(("arms", name), f"the arm {name!r} has no model.", "Write model: {type: NAME, ...}.")
-    return name
 
 
 def _described(
@@ -175,7 +163,15 @@ def urdf_text(chain: RigidChain, name: str) -> str:
         lines.append(f'  <joint name={_attribute(joint.name)} type="{"prismatic" if joint.slides else turning}">')
         lines += _placed(here, joint.base_T_joint, parent, child)
         lines.append(f'    <axis xyz="{_words(numbers(joint.axis))}"/>')
-        lines += [*_bounds(joint), "  </joint>", f'  <link name="{child}"/>']
+        if joint.limits and not joint.endless:
+            lower, upper = (repr(float(end)) for end in joint.limits)
+            lines.append(f'    <limit lower="{lower}" upper="{upper}" effort="{UNKNOWN}" velocity="{UNKNOWN}"/>')
+        elif joint.slides:
+            lines.append(f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>')
+        if joint.mimic is not None:
+            ratio = f'multiplier="{joint.mimic.multiplier!r}" offset="{joint.mimic.offset!r}"'
+            lines.append(f"    <mimic joint={_attribute(joint.mimic.master)} {ratio}/>")
+        lines += ["  </joint>", f'  <link name="{child}"/>']
         parent, here = child, joint.base_T_joint
     tip, taken = "tip", {joint.name for joint in chain.joints}
     while tip in taken:
@@ -193,19 +189,8 @@ def _placed(base_T_parent: Array, base_T_child: Array, parent: str, child: str) 
     yield f'    <child link="{child}"/>'
 
 
-def _bounds(joint: RigidJoint) -> Iterator[str]:
-    if joint.limits and not joint.endless:
-        lower, upper = (repr(float(end)) for end in joint.limits)
-        yield f'    <limit lower="{lower}" upper="{upper}" effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
-    elif joint.slides:
-        yield f'    <limit effort="{UNKNOWN}" velocity="{UNKNOWN}"/>'
-    if joint.mimic is not None:
-        numbers = (f'{key}="{getattr(joint.mimic, key)!r}"' for key in ("multiplier", "offset"))
-        yield f"    <mimic joint={_attribute(joint.mimic.master)} {' '.join(numbers)}/>"
-
-
 def _words(values: list[float]) -> str:
-    return " ".join(repr(value) for value in values)
+    return " ".join(map(repr, values))
 
 
 def _attribute(text: str) -> str:
@@ -234,8 +219,7 @@ class Link:
     alpha: float = 0.0
     turn: float = 0.0
 
-    def along(self) -> Array:
-        """Rot_z(theta) Trans_z(d) as a 4x4 matrix."""
+    def along(self) -> Array:  # Rot_z(theta) Trans_z(d)
         return _motion("z", self.theta, self.d)
 
     def across(self, convention: Convention) -> Array:
@@ -248,7 +232,11 @@ def mdh_section(chain: RigidChain, convention: Convention) -> dict[str, Any]:
     """Rows, and steps before and after them."""
     require_independent(chain, "mdh")
     require_plain_axes(chain, "mdh")
-    frame = _frame_on(chain.joints[0].base_T_joint, chain.joints[0].direction)
+    direction, frame = chain.joints[0].direction, np.array(chain.joints[0].base_T_joint)
+    x = frame[:3, 0] if abs(frame[:3, 0] @ direction) < 0.9 else frame[:3, 1]
+    x = x - direction * (direction @ x)
+    x = x / np.linalg.norm(x)
+    frame[:3, :3] = np.column_stack([x, np.cross(direction, x), direction])  # z along the first axis
     links: list[Link] = []
     base: Array = frame
     for i, beyond in enumerate(chain.joints[1:]):
@@ -259,43 +247,22 @@ def mdh_section(chain: RigidChain, convention: Convention) -> dict[str, Any]:
         links.append(link)
         frame = frame @ link.across(convention)
     tool: Array = np.asarray(np.linalg.solve(frame, chain.base_T_tool))
-    rows = _standard_rows(links) if convention == "standard" else _craig_rows(links)
+    rows: list[dict[str, Any]] = []
+    for before, here in zip([Link(), *links], [*links, Link()], strict=True):
+        across = here if convention == "standard" else before
+        turn = {"ry_deg": _degrees(across.turn)}
+        row: dict[str, Any] = {"alpha_deg": _degrees(across.alpha), "theta_deg": _degrees(here.theta)}
+        row |= {"a_mm": _millimetres(across.a), "d_mm": _millimetres(here.d)}
+        if across.turn and convention == "standard":
+            row["after"] = [turn]
+        elif across.turn:
+            row |= {"a_mm": 0.0, "before": [{"x_mm": _millimetres(across.a)}, turn]}
+        rows.append(row)
     for row, joint in zip(rows, chain.joints, strict=True):
         if joint.slides:
             row["kind"] = "prismatic"
-    names = [joint.name for joint in chain.joints]
-    return {
-        "type": "mdh",
-        "convention": convention,
-        "joints": names,
-        "base": _steps(base),
-        "rows": rows,
-        "tool": _steps(tool),
-    }
-
-
-def _standard_rows(links: list[Link]) -> list[dict[str, Any]]:
-    rows = []
-    for link in [*links, Link()]:
-        after = {"after": [{"ry_deg": _degrees(link.turn)}]} if link.turn else {}
-        rows.append({**_row(link.theta, link.d, link.a, link.alpha), **after})
-    return rows
-
-
-def _craig_rows(links: list[Link]) -> list[dict[str, Any]]:
-    rows = []
-    for before, here in zip([Link(), *links], [*links, Link()], strict=True):
-        if before.turn:
-            steps = [{"x_mm": _millimetres(before.a)}, {"ry_deg": _degrees(before.turn)}]
-            rows.append({**_row(here.theta, here.d, 0.0, before.alpha), "before": steps})
-        else:
-            rows.append(_row(here.theta, here.d, before.a, before.alpha))
-    return rows
-
-
-def _row(theta: float, d: float, a: float, alpha: float) -> dict[str, Any]:
-    lengths = {"a_mm": _millimetres(a), "d_mm": _millimetres(d)}
-    return {"alpha_deg": _degrees(alpha), "theta_deg": _degrees(theta), **lengths}
+    head = {"type": "mdh", "convention": convention, "joints": [joint.name for joint in chain.joints]}
+    return {**head, "base": _steps(base), "rows": rows, "tool": _steps(tool)}
 
 
 def _link(frame: Array, point: Array, direction: Array, convention: Convention) -> Link:
@@ -303,7 +270,16 @@ def _link(frame: Array, point: Array, direction: Array, convention: Convention) 
     p, w = frame[:3, :3].T @ (point - frame[:3, 3]), frame[:3, :3].T @ direction
     sine = math.hypot(w[0], w[1])
     if sine < NEARLY_PARALLEL:
-        return _nearly_parallel(p - w * (p[2] / w[2]), w, convention)
+        foot = p - w * (p[2] / w[2])
+        a = math.hypot(foot[0], foot[1])
+        theta = math.atan2(foot[1], foot[0]) if a > _NOWHERE else 0.0
+        x, y, z = _motion("z", -theta, 0.0)[:3, :3] @ w
+        side = math.copysign(1.0, z)
+        if convention == "standard":
+            alpha, turn = math.atan2(-y, z), math.asin(x)
+        else:
+            alpha, turn = math.atan2(-y, side * math.hypot(x, z)), math.atan2(side * x, side * z)
+        return Link(theta, 0.0, a if a > _NOWHERE else 0.0, alpha, turn if abs(turn) > _NOTHING else 0.0)
     normal = np.array([-w[1], w[0]]) / sine
     a = float(normal @ p[:2])
     # Towards the next axis; forwards where the two nearly meet, so that a small correction does not turn the row over.
@@ -313,27 +289,6 @@ def _link(frame: Array, point: Array, direction: Array, convention: Convention) 
     d = float(p[2] - w[2] * (p[:2] @ w[:2]) / sine**2)
     alpha = math.atan2(normal[0] * w[1] - normal[1] * w[0], w[2])
     return Link(math.atan2(normal[1], normal[0]), d, a if abs(a) > _NOTHING else 0.0, -alpha)
-
-
-def _nearly_parallel(foot: Array, w: Array, convention: Convention) -> Link:
-    a = math.hypot(foot[0], foot[1])
-    theta = math.atan2(foot[1], foot[0]) if a > _NOWHERE else 0.0
-    x, y, z = _motion("z", -theta, 0.0)[:3, :3] @ w
-    side = math.copysign(1.0, z)
-    if convention == "standard":
-        alpha, turn = math.atan2(-y, z), math.asin(x)
-    else:
-        alpha, turn = math.atan2(-y, side * math.hypot(x, z)), math.atan2(side * x, side * z)
-    return Link(theta, 0.0, a if a > _NOWHERE else 0.0, alpha, turn if abs(turn) > _NOTHING else 0.0)
-
-
-def _frame_on(frame: Array, direction: Array) -> Array:
-    x = frame[:3, 0] if abs(frame[:3, 0] @ direction) < 0.9 else frame[:3, 1]
-    x = x - direction * (direction @ x)
-    x = x / np.linalg.norm(x)
-    placed = np.array(frame)
-    placed[:3, :3] = np.column_stack([x, np.cross(direction, x), direction])
-    return placed
 
 
 def _steps(pose: Array) -> list[dict[str, float]]:

@@ -31,55 +31,38 @@ _NOTHING = Environment((0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the numbers of an export come from.
-
-    Attributes:
-        identity: hashes of what it was made from, by name (``arm``, ``data``).
-    """
+    """Where the numbers of an export come from."""
 
     experiment: str = ""  # the calibration's name
     created: str = ""  # when it was made (ISO 8601)
     software: Mapping[str, str] = field(default_factory=dict)  # versions by name
-    identity: Mapping[str, str] = field(default_factory=dict)
+    identity: Mapping[str, str] = field(default_factory=dict)  # hashes of what it was made from (``arm``, ``data``)
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """A measurement as calibrated.
+    """A measurement as calibrated."""
 
-    Attributes:
-        settings: its section of the configuration, in SI units (``type`` among them).
-        numbers: canonical entries by local name (``fx``, ``camera_rotation[w]``).
-        deviations: their standard deviations; None where a number is held.
-    """
-
-    settings: Mapping[str, Any]
-    numbers: Mapping[str, float]
-    deviations: Mapping[str, float | None]
+    settings: Mapping[str, Any]  # its section of the configuration, in SI units (``type`` among them)
+    numbers: Mapping[str, float]  # canonical entries by local name (``fx``, ``camera_rotation[w]``)
+    deviations: Mapping[str, float | None]  # their standard deviations; None where a number is held
 
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What is to be written: an arm, its instance name, and its calibrated parameters by full name.
-
-    Attributes:
-        tilt: how the real gravity is turned from the stated one, by full name (``statics.gravity_rx``; rad).
-        entries: what the calibration says of each number: unit, nominal value, value, standard deviation.
-        description: the arm as a configuration in SI units: ``model``, ``effects``, ``links``.
-        instruments: measurements by name: their settings, and what the calibration says of their numbers.
-    """
+    """What is to be written: an arm, its instance name, and its calibrated parameters by full name."""
 
     name: str  # the arm's instance name
     arm: Arm  # the arm
     values: Mapping[str, Array]  # its own calibrated parameters by full name (SI)
-    tilt: Mapping[str, Array] = field(default_factory=dict)
+    tilt: Mapping[str, Array] = field(default_factory=dict)  # of gravity: ``statics.gravity_rx`` (rad), by full name
     environment: Environment = _NOTHING  # what acts where nothing is said
     payload_stated: bool = True  # whether the calibration says what hangs on the tool
-    entries: tuple[ParameterRecord, ...] = ()
-    description: Mapping[str, Any] = field(default_factory=dict)
+    entries: tuple[ParameterRecord, ...] = ()  # what the calibration says of each number
+    description: Mapping[str, Any] = field(default_factory=dict)  # as configured, in SI: ``model``, ``effects``
     origin: Origin = field(default_factory=Origin)  # where the numbers come from
     out: str = ""  # the name of the file that is written, for formats whose files name one another
-    instruments: Mapping[str, Instrument] = field(default_factory=dict)
+    instruments: Mapping[str, Instrument] = field(default_factory=dict)  # measurements by name
 
     def expression(self, conditions: Sequence[str] = ()) -> ToolExpression:
         """The arm as expressions of commands, load and elastic state; ``conditions`` are told, not taken as known."""
@@ -97,19 +80,14 @@ class ExportRequest:
 
 @dataclass(frozen=True)
 class Exported:
-    """A file's content, how many of the arm's numbers changed in it, and what of the arm it cannot hold.
-
-    Attributes:
-        reach: how far what is left out moves the tool, at most over random poses (m), where the exporter measured it;
-            None for all effects together, which armcal measures.
-    """
+    """A file's content, how many of the arm's numbers changed in it, and what of the arm it cannot hold."""
 
     content: bytes  # of the file that was asked for
     changed: int  # how many numbers are not the nominal ones
     left_out: tuple[str, ...] = ()  # what the format cannot hold
     companions: Mapping[str, bytes] = field(default_factory=dict)  # further files by name, which are written beside it
     remarks: tuple[str, ...] = ()  # what whoever uses the files should know, a sentence each
-    reach: float | None = None
+    reach: float | None = None  # how far what is left out moves the tool at most (m); None: armcal measures it
 
 
 class Exporter(Protocol):
@@ -200,10 +178,8 @@ def effects_reach(
 ) -> float | None:
     """How far the calibrated arm is from the same one without effects and pose residual, at most over random poses (m).
 
-    With ``of`` the residual from the same one without that alone.
-
-    Under the configured gravity and load, no load where none is configured. None where an elastic arm does not
-    settle in all poses.
+    With ``of`` the residual from the same one without that alone. Under the configured gravity and load, no load where
+    none is configured. None where an elastic arm does not settle in all poses.
     """
     commands = random_commands(request.arm)
     statics = calibration.system.statics

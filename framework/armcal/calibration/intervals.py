@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from armcal.arm.assembly import Arm, command_channels
 from armcal.arm.pose_residual import LEAST_MARGIN, MARGIN
@@ -24,7 +24,6 @@ from armcal.config.system import System
 from armcal.diagnose.coverage import Stretch, level_name
 from armcal.errors import DataError
 from armcal.estimate.prediction import POSITION, STATED, TURN, Predictor, Spread, is_position
-from armcal.estimate.validation import Recording
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components
 from armcal.io.plain_files import input_file
 from armcal.measure.reader import RequestedChannel
@@ -36,18 +35,14 @@ _DIGITS = 12
 
 
 class PredictionRecord(Settings):
-    """What predictions need beyond values: covariance of the free entries (lower triangle), stretches, what drifts.
-
-    ``columns`` are what the calibration's data called its columns; ``ranges`` those of joints and payload in its
-    records (SI; see ``recorded_ranges``).
-    """
+    """What predictions need beyond values."""
 
     entries: tuple[str, ...]
-    covariance: tuple[tuple[float, ...], ...]
+    covariance: tuple[tuple[float, ...], ...]  # of the free entries, the lower triangle
     stretches: dict[Literal["same", "new"], Stretch] = Field(default_factory=dict)
-    columns: dict[str, str] = Field(default_factory=dict)
+    columns: dict[str, str] = Field(default_factory=dict)  # what the calibration's data called its columns
     drifts: dict[str, Drift] = Field(default_factory=dict)
-    ranges: dict[str, tuple[float, float]] = Field(default_factory=dict)
+    ranges: dict[str, tuple[float, float]] = Field(default_factory=dict)  # of joints and payload in its records (SI)
 
     def columns_in(self, path: Path, requested: Sequence[RequestedChannel]) -> dict[str, str]:
         """What the calibration's data called the columns of these channels, as far as a CSV has them."""
@@ -64,42 +59,17 @@ class PredictionRecord(Settings):
             if own in header and name not in header and (name in used or (split_suffix(name) or (name,))[0] in used)
         }
 
-    @model_validator(mode="before")
-    @classmethod
-    def _as_before(cls, record: Any) -> Any:
-        """Earlier versions kept the records that tell of a drift."""
-        if isinstance(record, dict) and "recording" in record:
-            before = record["recording"] or {}
-            record = {**{k: v for k, v in record.items() if k != "recording"}, "drifts": before.get("drifts", {})}
-        return record
-
-    @property
-    def symmetric_covariance(self) -> Array:
-        lower = np.zeros((len(self.covariance), len(self.covariance)))
-        for i, row in enumerate(self.covariance):
-            lower[i, : i + 1] = row
-        return lower + np.tril(lower, -1).T
-
 
 @dataclass(frozen=True)
 class PlusMinus:
-    """How far measurements may lie from predictions.
+    """How far measurements may lie from predictions; none of a measurement that no residual determines."""
 
-    Attributes:
-        deviations: standard deviation of each channel (N each; SI), not stretched; none of a measurement whose residual
-            does not follow from its readings.
-        radii: of each position measurement by name: of a ball about the prediction that holds 95 % (N each; m).
-        covariances: of each position measurement by name, stretched as half widths are (N x 3 x 3 each; m^2).
-        turns: of each pose measurement by name: angles that 90 % of the orientations lie within (N each; rad).
-        unknown: how little learned pose residuals know of each pose (N; m, standard deviation); None without any.
-    """
-
-    deviations: dict[str, Array]
+    deviations: dict[str, Array]  # of each channel (N each; SI), not stretched
     half_widths: dict[str, Array]  # of 90 % intervals, stretched as cross-validation found (N each)
-    radii: dict[str, Array]
-    covariances: dict[str, Array] = field(default_factory=dict)
-    turns: dict[str, Array] = field(default_factory=dict)
-    unknown: Array | None = None
+    radii: dict[str, Array]  # of positions: of a ball about the prediction that holds 95 % (N each; m)
+    covariances: dict[str, Array] = field(default_factory=dict)  # of positions, stretched too (N x 3 x 3 each; m^2)
+    turns: dict[str, Array] = field(default_factory=dict)  # of poses: angles that 90 % lie within (N each; rad)
+    unknown: Array | None = None  # how little learned pose residuals know of each pose (N; m, standard deviation)
 
 
 def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
@@ -119,23 +89,17 @@ class Uncertainty:
     components: tuple[Component, ...] = ()  # estimated variances, if there were any
 
     def plus_minus(self, commands: Dataset) -> PlusMinus:
-        """How far measurements at these commands may lie from predictions, in a recording of its own.
-
-        Args:
-            commands: records with joint angles, load, gravity.
-        """
+        """How far measurements at these commands may lie from predictions, in a recording of its own."""
         problem, commands = self._with_predictions(commands)
-        parts = [self._part(problem, commands.subset(chunk), chunk) for chunk in _chunks(np.arange(len(commands)))]
-        plus_minus = _joined(problem, parts, len(commands), self.record.stretches.get(self._recording))
+        chunks = [np.arange(i, min(i + _AT_ONCE, len(commands))) for i in range(0, len(commands), _AT_ONCE)]
+        parts = [self._part(problem, commands.subset(chunk), chunk) for chunk in chunks]
+        # Its intervals hold in recordings alike the calibration's: where something drifts, in a new one.
+        stretch = self.record.stretches.get("new" if self.record.drifts else "same")
+        plus_minus = _joined(problem, parts, len(commands), stretch)
         if not any(arm.residual and arm.residual.is_learned for arm in self.system.arms.values()):
             return plus_minus
         unknown = [sizes_of(unexplained(problem.of(commands.subset(part.places)), self.values)) for part in parts]
         return replace(plus_minus, unknown=np.concatenate([np.zeros(0), *unknown]))
-
-    @property
-    def _recording(self) -> Recording:
-        """In which recordings alike the calibration's its intervals hold: where something drifts, in a new one."""
-        return "new" if self.record.drifts else "same"
 
     def _part(self, problem: Problem, commands: Dataset, places: Indices) -> _Part:
         problem = with_joint_noise(problem.of(commands), self.values, self.noise_scale)
@@ -145,7 +109,10 @@ class Uncertainty:
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
             estimated = VarianceComponents(self.components, (), (), 0.0)
             whitened = apply_components(problem, self.values, estimated, axes)
-        by = Predictor(self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom)
+        lower = np.zeros((len(self.record.covariance),) * 2)
+        for i, row in enumerate(self.record.covariance):
+            lower[i, : i + 1] = row
+        by = Predictor(self.values, lower + np.tril(lower, -1).T, self.noise_scale, self.freedom)
         spreads = self._from_either_side(problem, by.spreads(whitened, "new"), commands)
         return _Part(places, spreads, reading_slopes(problem, self.values))
 
@@ -171,41 +138,20 @@ class Uncertainty:
         unread = dict.fromkeys(names, np.zeros(len(commands)))
         sides = [f"{arm.name}.{APPROACH}{joint}" for arm in self.system.arms.values() for joint in arm.commanded]
         commands = replace(commands, channels={**dict.fromkeys(sides, np.zeros(len(commands))), **commands.channels})
-        problem = self._problem(replace(commands, channels={**commands.channels, **unread}))
+        drifts, system = self.record.drifts.items(), self.system
+        drifting = self.parameters.replaced({n: replace(self.parameters[n], drift=d) for n, d in drifts})
+        dataset = replace(commands, channels={**commands.channels, **unread})
+        parts = (system.arms, system.measurements, drifting, system.environment, dataset)
+        problem = Problem.build(*parts, "interpreted", groups={})
         read = problem.by_channel(problem.predict(self.values))
         return problem, replace(commands, channels={**unread, **commands.channels, **read})
-
-    def _problem(self, dataset: Dataset) -> Problem:
-        drifts = self.record.drifts.items()
-        drifting = self.parameters.replaced({n: replace(self.parameters[n], drift=d) for n, d in drifts})
-        system = self.system
-        parts = (system.arms, system.measurements, drifting, system.environment, dataset)
-        return Problem.build(*parts, "interpreted", groups={})
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Some records: their places, and by factor the spreads of their residuals.
-
-    ``slopes`` (N x outputs x n_r) are those of the readings by residuals.
-    """
-
-    places: Indices
-    spreads: tuple[Spread, ...]
-    slopes: tuple[Array | None, ...]
-
-    def of_readings(self, place: int) -> Spread | None:
-        """The spread of the readings of one factor; None where they do not follow from residuals.
-
-        A reading that no residual depends on is not known to any extent: not a number.
-        """
-        slope, spread = self.slopes[place], self.spreads[place]
-        if slope is None:
-            return None
-        covariance = slope @ spread.covariance @ slope.transpose(0, 2, 1)
-        idle = ~np.any(slope != 0, axis=2)
-        covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
-        return Spread(covariance, spread.freedom)
+    places: Indices  # of its records
+    spreads: tuple[Spread, ...]  # of their residuals, by factor
+    slopes: tuple[Array | None, ...]  # of the readings by residuals (N x outputs x n_r)
 
 
 def _joined(problem: Problem, parts: Sequence[_Part], count: int, own: Stretch | None) -> PlusMinus:
@@ -214,12 +160,16 @@ def _joined(problem: Problem, parts: Sequence[_Part], count: int, own: Stretch |
     factor = own.radius if own and own.radius is not None else 1.0
     for place, kernel in enumerate(problem.kernels):
         channels, name = kernel.factor.output_channels, kernel.factor.name
-        spreads = [part.of_readings(place) for part in parts]
-        if not channels or any(spread is None for spread in spreads):
-            continue
+        if not channels or any(part.slopes[place] is None for part in parts):
+            continue  # its readings do not follow from residuals
         rows, radius, turn = (np.full((*size, count), np.nan) for size in ((2, len(channels)), (), ()))
         covariance = np.full((count, len(channels), len(channels)), np.nan)
-        for part, spread in zip(parts, filter(None, spreads), strict=True):
+        for part in parts:
+            slope = np.asarray(part.slopes[place])
+            own_covariance = slope @ part.spreads[place].covariance @ slope.transpose(0, 2, 1)
+            idle = ~np.any(slope != 0, axis=2)  # a reading that no residual depends on is not known to any extent
+            own_covariance[idle[:, :, None] | idle[:, None, :]] = np.nan
+            spread = Spread(own_covariance, part.spreads[place].freedom)
             rows[:, :, part.places] = spread.deviations, stretch * spread.half_widths(STATED)
             covariance[part.places] = stretch**2 * spread.covariance
             if is_position(kernel):
@@ -232,10 +182,6 @@ def _joined(problem: Problem, parts: Sequence[_Part], count: int, own: Stretch |
         if is_position(kernel) and len(channels) > len(POSITION):
             plus_minus.turns[name] = turn
     return plus_minus
-
-
-def _chunks(places: Indices) -> list[Indices]:
-    return [places[start : start + _AT_ONCE] for start in range(0, len(places), _AT_ONCE)]
 
 
 PAYLOAD = "payload"
@@ -301,10 +247,7 @@ class RecordedRange:
 def beyond_records(
     ranges: Ranges, dataset: Dataset, arms: Mapping[str, Arm], unknown: Array | None = None
 ) -> tuple[Mask, str]:
-    """Which poses of a dataset lie beyond these ranges (N), and a sentence about them, empty if none does.
-
-    ``unknown`` is how little a pose residual knows of each (N; m).
-    """
+    """Which poses of a dataset lie beyond these ranges (N), and a sentence about them, empty if none does."""
     if unknown is not None:
         dataset = replace(dataset, channels={**dataset.channels, UNKNOWN: unknown})
     channels = [*filter(dataset.has, ranges)]

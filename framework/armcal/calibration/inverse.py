@@ -58,8 +58,6 @@ REACHED = 2.0  # How a search ends that reaches its target; others end with 1, a
 
 @dataclass(frozen=True)
 class Slopes:
-    """How the tool moves with the commands, in equilibrium to first order."""
-
     left: Expression  # what is left of the equilibrium, d0 (n_d)
     state: Expression  # d state / d commands (n_d x n)
     tool: Expression  # d (rotation column by column, then position) / d commands (12 x n)
@@ -105,7 +103,14 @@ def tool_error(own_slopes: Slopes, target: Expression, aim: Aim) -> tuple[Expres
         return away, slope
     here, moved = ca.reshape(own_slopes.corrected[:9], 3, 3), _twists(own_slopes)
     if aim == "pose":
-        return ca.vertcat(away, _rotation_vector(here, ca.reshape(target[3:], 3, 3))), moved
+        # The turn (rad, base frame) as a rotation vector; nothing is differentiated through it.
+        there = ca.reshape(target[3:], 3, 3)
+        sine = sum((ca.cross(here[:, i], there[:, i]) for i in range(3)), ca.SX(3, 1)) / 2
+        cosine = (sum((ca.dot(here[:, i], there[:, i]) for i in range(3)), ca.SX(0)) - 1) / 2
+        size = ca.sqrt(ca.dot(sine, sine))
+        # Where both vanish together, as in a half turn, the direction is lost; elsewhere the ratio tends to one.
+        small = size < 1e-9
+        return ca.vertcat(away, sine * ca.if_else(small, 1, ca.atan2(size, cosine) / ca.if_else(small, 1, size))), moved
     axis, along = here @ target[6:9], target[3:6]
     about = ca.cross(axis, along)
     sine = ca.sqrt(ca.sumsqr(about))
@@ -170,12 +175,7 @@ def search_function(expression: ToolExpression, own_slopes: Slopes, aim: Aim) ->
 
 
 class _Search:
-    """What a step makes of the progress of a search.
-
-    Attributes:
-        stated: SETTINGS.
-        now: the progress by name.
-    """
+    """What a step makes of the progress of a search, by name."""
 
     def __init__(self, joints: int, settings: Expression, now: Mapping[str, Expression]) -> None:
         self.stated = dict(zip(SETTINGS, ca.vertsplit(settings[: len(SETTINGS)]), strict=True))
@@ -276,28 +276,12 @@ def _step(
     return step, damping * preference + slope.T @ (error - held @ step)
 
 
-def _rotation_vector(here: Expression, there: Expression) -> Expression:
-    """The turn (rad, base frame) from one rotation to another; nothing is differentiated through it."""
-    sine = sum((ca.cross(here[:, i], there[:, i]) for i in range(3)), ca.SX(3, 1)) / 2
-    cosine = (sum((ca.dot(here[:, i], there[:, i]) for i in range(3)), ca.SX(0)) - 1) / 2
-    size = ca.sqrt(ca.dot(sine, sine))
-    # Where both vanish together, as in a half turn, the direction is lost; elsewhere the ratio tends to one.
-    small = size < 1e-9
-    return sine * ca.if_else(small, 1, ca.atan2(size, cosine) / ca.if_else(small, 1, size))
-
-
 @dataclass(frozen=True)
 class Goal:
-    """What commands are sought for.
-
-    Attributes:
-        towards: commands to come near to where the target leaves a choice (n x N); None for no preference.
-    """
-
     record: Array  # channels x N; with the commands from which the search starts
     state: Array  # n_d x N; where the search starts
     target: Array  # what an aim says of it (SIZES x N)
-    towards: Array | None = None
+    towards: Array | None = None  # commands to come near to where the target leaves a choice (n x N)
 
     def subset(self, rows: Indices) -> Goal:
         towards = None if self.towards is None else chosen_of(self.towards, rows)
@@ -307,8 +291,6 @@ class Goal:
 
 @dataclass(frozen=True)
 class Solutions:
-    """What was found of targets (N)."""
-
     commands: Array  # n x N (rad or m); of those that are not reached, the nearest
     states: Array  # n_d x N
     distances: Array  # what is left (m)
@@ -341,8 +323,6 @@ class Solutions:
 
 @dataclass(frozen=True)
 class Manner:
-    """How a search goes on."""
-
     damping: float  # times the squared error
     patience: int  # steps in which an error must halve, or the search ends
     steps: int  # at most
@@ -359,25 +339,17 @@ _ROUGH = (1e-3, 5e-3, 1e-2)  # Where rough steps end
 
 
 class Solver:
-    """Searches for one arm and one kind of target: with rough steps until one is near, exactly from there.
-
-    Attributes:
-        limits: n x 2 (rad or m).
-        aim: what targets state.
-        length: how many metres a radian counts for.
-        states: how many numbers the elastic state has.
-    """
+    """Searches for one arm and one kind of target: with rough steps until one is near, exactly from there."""
 
     def __init__(
         self,
         expression: ToolExpression,
-        limits: Array,
+        limits: Array,  # n x 2 (rad or m)
         aim: Aim,
-        length: float,
-        tolerance: tuple[float, float],
+        length: float,  # how many metres a radian counts for
+        tolerance: tuple[float, float],  # within which targets are reached (m, rad)
         choice: EvaluatorChoice = "auto",
     ) -> None:
-        """Targets are reached within tolerances in m and rad."""
         self.length, self.aim, self.limits, self.states = length, aim, limits, expression.state.numel()
         self._near, self._places = (*tolerance, _REST), progress_places(len(limits), self.states)
 
@@ -399,7 +371,6 @@ class Solver:
         return self._exact.compiled
 
     def __call__(self, goal: Goal, manner: Manner = QUICK) -> Solutions:
-        """Search from where the goal starts."""
         if self._rough is None:
             return self.exactly(goal, manner)
         first = self._search(self._rough, replace(goal, towards=None), manner, _ROUGH)
@@ -437,7 +408,6 @@ class Solver:
 
 
 def with_commands(record: Array, commands: Array) -> Array:
-    """Records (channels x N) with other commands (n x N)."""
     moved = record.copy()
     moved[: len(commands)] = commands
     return moved
@@ -478,7 +448,18 @@ class Finder:
                 self._round(record, target, todo, self._picked(target[:, todo], used, wide), solutions)
             lost = lost[~solutions.there[lost]]
             used += wide
-        self._nearest(record, target, lost, solutions)
+        # Of targets that were not reached, the commands that come nearest; a longer search reaches some after all.
+        wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
+        for todo in _chunks(lost, wide + 1):
+            commands, states = self._seeds.at(self._picked(target[:, todo], 0, wide))
+            commands = np.concatenate([solutions.commands[:, todo, None], commands], axis=2)
+            states = np.concatenate([solutions.states[:, todo, None], states], axis=2)
+            attempt, _ = self._searched(record, target, todo, commands, states, NEAREST)
+            left = attempt.distances + self.solver.length * attempt.turns
+            left = np.where(self._may(attempt.commands), left, np.inf)
+            best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
+            solutions.put(todo, attempt, best)
+            solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])
         return solutions
 
     def postures(self, record: Array, target: Array, count: int) -> list[Array]:
@@ -553,8 +534,7 @@ class Finder:
         solutions.replace(good, attempt.subset(good))
         return solutions
 
-    def _picked(self, target: Array, used: int, wide: int) -> Indices:
-        """The next seeds of each target (N x wide)."""
+    def _picked(self, target: Array, used: int, wide: int) -> Indices:  # N x wide
         apart = self._seeds.apart(target, self.solver.length)
         if used == 0 and wide == 1:
             return np.asarray(apart.argmin(axis=1)[:, None])
@@ -576,21 +556,6 @@ class Finder:
         near = np.where(attempt.there, np.inf, left).reshape(-1, wide).argmin(axis=1) + np.arange(len(todo)) * wide
         closer = ~had & (left[near] < solutions.distances[todo] + self.solver.length * solutions.turns[todo])
         solutions.put(todo[closer], attempt, near[closer])
-
-    def _nearest(self, record: Array, target: Array, lost: Indices, solutions: Solutions) -> None:
-        """Of targets that were not reached, the commands that come nearest; a longer search reaches some after all."""
-        wide = min(_NEAREST_STARTS, self._seeds.commands.shape[1] - 1)
-        for todo in _chunks(lost, wide + 1):
-            picks = self._picked(target[:, todo], 0, wide)
-            commands, states = self._seeds.at(picks)
-            commands = np.concatenate([solutions.commands[:, todo, None], commands], axis=2)
-            states = np.concatenate([solutions.states[:, todo, None], states], axis=2)
-            attempt, _ = self._searched(record, target, todo, commands, states, NEAREST)
-            left = attempt.distances + self.solver.length * attempt.turns
-            left = np.where(self._may(attempt.commands), left, np.inf)
-            best = left.reshape(-1, wide + 1).argmin(axis=1) + np.arange(len(todo)) * (wide + 1)
-            solutions.put(todo, attempt, best)
-            solutions.there[todo] = attempt.there[best] & np.isfinite(left[best])  # a longer search may arrive
 
     def _searched(
         self, record: Array, target: Array, todo: Indices, commands: Array, states: Array, manner: Manner = QUICK
@@ -631,20 +596,22 @@ def _chunks(rows: Indices, wide: int) -> Iterator[Indices]:
 
 
 class Seeds:
-    """Commands spread over what the joints allow, with the tools there.
+    """Commands (n x M; rad or m) spread evenly over what the joints allow, with states (n_d x M) and tools there.
 
-    Attributes:
-        commands: n x M (rad or m).
-        states: n_d x M.
+    Commands at which the springs do not hold are left out.
     """
 
     def __init__(
         self, expression: ToolExpression, equilibrium: Equilibrium, limits: Array, count: int, seed: int
     ) -> None:
-        """Spread evenly; commands at which the springs do not hold are left out."""
-        tried = _tried(expression, limits)
-        points = _spread_evenly(len(limits), count, seed)
-        commands = tried[:, :1] + points * (tried[:, 1:] - tried[:, :1])
+        kinds = [expression.arm.commanded[joint] for joint in expression.joints]
+        reach = np.array([FREE_ANGLE if kind == "angle" else FREE_TRAVEL for kind in kinds])
+        low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], np.minimum(-reach, limits[:, 1] - 2 * reach))
+        high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.maximum(reach, limits[:, 0] + 2 * reach))
+        wide = high - low > 2 * _WIDEST
+        middle = np.minimum(np.maximum(0.0, low + _WIDEST), high - _WIDEST)
+        low, high = np.where(wide, middle - _WIDEST, low), np.where(wide, middle + _WIDEST, high)
+        commands = low[:, None] + _spread_evenly(len(limits), count, seed) * (high - low)[:, None]
         standing = equilibrium(expression.records(commands))
         kept = standing.settled
         self.commands, self.states = commands[:, kept], standing.states[:, kept]
@@ -655,8 +622,7 @@ class Seeds:
         places = self._tools[:, :3, 3]
         return float(np.median(np.linalg.norm(places - places.mean(axis=0), axis=1)))
 
-    def at(self, picks: Indices) -> tuple[Array, Array]:
-        """Commands and states of some (n x and n_d x the shape of ``picks``)."""
+    def at(self, picks: Indices) -> tuple[Array, Array]:  # n x and n_d x the shape of ``picks``
         return np.take(self.commands, picks, axis=1), np.take(self.states, picks, axis=1)
 
     def apart(self, targets: Array, length: float) -> Array:
@@ -679,13 +645,3 @@ def _spread_evenly(dimensions: int, count: int, seed: int) -> Array:
     steps = root ** -np.arange(1.0, dimensions + 1)
     shift = np.random.default_rng(seed).random(dimensions)
     return np.asarray((shift[:, None] + steps[:, None] * np.arange(count)) % 1.0)
-
-
-def _tried(expression: ToolExpression, limits: Array) -> Array:
-    kinds = [expression.arm.commanded[joint] for joint in expression.joints]
-    reach = np.array([FREE_ANGLE if kind == "angle" else FREE_TRAVEL for kind in kinds])
-    low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], np.minimum(-reach, limits[:, 1] - 2 * reach))
-    high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.maximum(reach, limits[:, 0] + 2 * reach))
-    wide = high - low > 2 * _WIDEST
-    middle = np.minimum(np.maximum(0.0, low + _WIDEST), high - _WIDEST)
-    return np.stack([np.where(wide, middle - _WIDEST, low), np.where(wide, middle + _WIDEST, high)], axis=1)

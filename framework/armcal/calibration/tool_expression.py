@@ -38,14 +38,8 @@ Made = TypeVar("Made")
 class ToolExpression(ElasticPass):
     """One arm whose parameters are numbers.
 
-    Attributes:
-        channels: of ``record``, in this order: the joints, ``approach.JOINT`` of each, LOAD_CHANNELS, conditions, tuned
-            parameters.
-        record: symbols, one a channel (commands in rad or m, approaches -1 to 1, loads in SI, in the base frame).
-        origins: of the mount and of each joint's frame in the base frame, at ``state`` (3x1 each; m).
-        tool_T_point: the point of the tool that ``base_T_tool`` is of (constant); the tool itself unless ``at`` chose.
-        blocks: the numbers of each block of parameters, tuned or not.
-        functions: what was made of the expressions so far, by name; see ``made``.
+    ``channels`` are those of ``record``, a symbol each: the joints (rad or m), ``approach.JOINT`` of each (-1 to 1),
+    LOAD_CHANNELS (SI, base frame), conditions, tuned parameters.
     """
 
     name: str  # the arm's instance name
@@ -54,14 +48,14 @@ class ToolExpression(ElasticPass):
     channels: tuple[str, ...]
     defaults: Array  # of each channel where nothing is said; commands and approaches are zero
     base_T_tool: Transform  # at ``state``
-    origins: tuple[Expression, ...]
+    origins: tuple[Expression, ...]  # of the mount and each joint's frame in the base frame, at ``state`` (3x1; m)
     efforts: Expression  # about or along the axes of all joints of the chain, at ``state`` (N m, N on sliding joints)
     servos: Mapping[str, tuple[PulseTable, PulseClock]]  # by commanded joint, which displacements can be set
-    tool_T_point: Transform = field(default_factory=se3.identity)
+    tool_T_point: Transform = field(default_factory=se3.identity)  # the point that ``base_T_tool`` is of (constant)
     conditions: tuple[str, ...] = ()
     tuned: frozenset[str] = frozenset()  # blocks of parameters
-    blocks: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    functions: dict[Hashable, Any] = field(init=False, default_factory=dict, repr=False)
+    blocks: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # numbers of all parameters, tuned or not
+    functions: dict[Hashable, Any] = field(init=False, default_factory=dict, repr=False)  # see ``made``
 
     def at(self, tool_T_point: Transform) -> Self:
         """The same arm, with another point of its tool (constant) where the tool's frame is."""
@@ -84,9 +78,9 @@ class ToolExpression(ElasticPass):
 
         ``parameters`` are of a calibration of the same arm; None if a value differs that is a constant here.
         """
-        blocks = _blocks(parameters)
         if not self.tuned.issuperset(self.differing(parameters)):
             return None
+        blocks = _blocks(parameters)
         entries = {entry: value for name in self.tuned for entry, value in _entries(name, blocks[name])}
         entries |= zip(LOAD_CHANNELS, environment.acting, strict=True)
         if _POINT[0] in self.channels:
@@ -162,15 +156,14 @@ def arm_expression(
 
     ``conditions`` are those of the surroundings that will be stated (``temperature``); others are taken as the
     effects take what is not stated. ``tuned`` parameters are channels of a record, as ``retuned`` needs it.
-
-    Raises:
-        ValueError: the arm does not change with a condition.
     """
     idle = [name for name in conditions if name not in arm.conditions]
     if idle:
         known = ", ".join(arm.conditions) or "nothing of the surroundings"
         raise ValueError(f"the arm {arm.name} does not change with {', '.join(idle)}; it changes with {known}")
-    smooth, servos = _without_steps(arm)
+    stepped = {name: effect for name, effect in arm.effects.items() if isinstance(effect, SteppedEffect)}
+    servos = {arm.joint_names[i]: servo for effect in stepped.values() for i, servo in effect.servos().items()}
+    smooth = replace(arm, effects={name: effect for name, effect in arm.effects.items() if name not in stepped})
     joints = tuple(arm.commanded)
     blocks = _blocks(parameters)
     symbolic = frozenset(tuned) & blocks.keys()
@@ -211,13 +204,6 @@ def arm_expression(
     )
 
 
-def _without_steps(arm: Arm) -> tuple[Arm, dict[str, tuple[PulseTable, PulseClock]]]:
-    stepped = {name: effect for name, effect in arm.effects.items() if isinstance(effect, SteppedEffect)}
-    servos = {arm.joint_names[i]: servo for effect in stepped.values() for i, servo in effect.servos().items()}
-    kept = {name: effect for name, effect in arm.effects.items() if name not in stepped}
-    return replace(arm, effects=kept), servos
-
-
 def sample_inputs(expression: ToolExpression) -> list[Array]:
     """A random record and state (8 columns each), to compare two forms of a function."""
     commands = np.random.default_rng(0).uniform(-1, 1, (len(expression.joints), 8))
@@ -226,16 +212,12 @@ def sample_inputs(expression: ToolExpression) -> list[Array]:
 
 @dataclass(frozen=True)
 class Standing:
-    """Arms in equilibrium: states (n_d x N), tools (N x 4 x 4), and which settled where their springs hold them (N)."""
-
-    states: Array
-    base_T_tool: Array
-    settled: Mask
+    states: Array  # n_d x N
+    base_T_tool: Array  # N x 4 x 4
+    settled: Mask  # which stand where their springs hold them (N)
 
 
 class Equilibrium:
-    """The equilibria of one arm."""
-
     def __init__(self, expression: ToolExpression, choice: EvaluatorChoice = "auto") -> None:
         self._size = expression.state.numel()
         many = partial(BatchFunction, sample=sample_inputs(expression), choice=choice)
@@ -272,9 +254,8 @@ _SAME_M = 1e-9
 class MeasuredPoint:
     """What a measurement reads of a tool.
 
-    Attributes:
-        fitted: whether free parameters of the measurement say where the target sits: the records then determine where
-            the target goes, and not where the tool's origin is beside it.
+    Where free parameters of the measurement say where the target sits (``fitted``), the records determine where the
+    target goes, and not where the tool's origin is beside it.
     """
 
     measurement: str  # its instance name

@@ -1,6 +1,6 @@
 """What is done with a calibrated arm: ``armcal predict``, ``compensate``, ``export``, ``convert``, ``calibration``."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -87,22 +87,26 @@ def predict(console: Console, calibration: Path, poses: Path, out: Path, accept:
         plus_minus = loaded.plus_minus(commands)
         if unknown := [name for name in channels if not np.isfinite(plus_minus.half_widths.get(name, np.nan)).any()]:
             console.warn(f"how far {', '.join(unknown)} may be off is not known: no residual determines it.")
-    requested = requested_channels(system.arms, loaded.readable, measured=False)
+    requested = [*requested_channels(system.arms, loaded.readable, measured=False)]
     if not loaded.readable:
-        requested = (*requested, *_tool_channels(tuple(system.arms)))
+        tool = [(f"tool_{axis}", "length") for axis in "xyz"] + [(f"tool_q{axis}", DIMENSIONLESS) for axis in "wxyz"]
+        for own, name, dimension in ((f"{arm}.{name}", name, kind) for arm in system.arms for name, kind in tool):
+            names = (own, name) if len(system.arms) == 1 else (own,)
+            requested.append(RequestedChannel(own, names, dimension, required=False))
     shown = [channel for channel in requested if channel.channel in channels]
     extra, medians = _half_widths(plus_minus, shown) if plus_minus else ({}, {})
-    extra |= _beyond(console, loaded, commands, plus_minus)
+    kept = loaded.record.prediction
+    if kept is not None and kept.ranges:
+        beyond, text = beyond_records(kept.ranges, commands, system.arms, plus_minus.unknown if plus_minus else None)
+        extra["beyond_records"] = tuple("1" if own else "0" for own in beyond)
+        if text:
+            console.warn(text)
     write_csv(out, replace(commands, channels=channels, extra=extra), shown)
     _show_predicted(console, commands, out, plus_minus, medians)
 
 
 def _show_predicted(
-    console: Console,
-    commands: Dataset,
-    out: Path,
-    plus_minus: PlusMinus | None,
-    medians: Mapping[str, float],
+    console: Console, commands: Dataset, out: Path, plus_minus: PlusMinus | None, medians: Mapping[str, float]
 ) -> None:
     typical = {}  # medians over the poses
     if plus_minus is not None and plus_minus.radii:
@@ -112,15 +116,8 @@ def _show_predicted(
     if plus_minus is not None and plus_minus.turns:
         turns = np.concatenate(list(plus_minus.turns.values()))
         typical["turn_90_deg"] = float(np.rad2deg(np.median(turns)))
-    console.result(
-        {
-            "poses": len(commands),
-            "set_aside": len(commands.set_aside),
-            "out": str(out),
-            **typical,
-            "half_width_90": medians,
-        }
-    )
+    counts = {"poses": len(commands), "set_aside": len(commands.set_aside)}
+    console.result({**counts, "out": str(out), **typical, "half_width_90": medians})
     console.out.print(f"{len(commands)} poses predicted: {out}")
     named = [f"{column} {half:.2g}" for column, half in medians.items()]
     text = ", ".join(named[:_MOST_NAMED]) + (f" and {len(named) - _MOST_NAMED} more" if named[_MOST_NAMED:] else "")
@@ -134,14 +131,6 @@ def _show_predicted(
         text += " (90 %)"
     if text:
         console.out.print(f"+- {text}, in the median pose", soft_wrap=not typical)
-
-
-def _tool_channels(arms: Sequence[str]) -> Iterator[RequestedChannel]:
-    for tool in arms:
-        names = [(f"tool_{axis}", "length") for axis in "xyz"] + [(f"tool_q{axis}", DIMENSIONLESS) for axis in "wxyz"]
-        for name, dimension in names:
-            own = f"{tool}.{name}"
-            yield RequestedChannel(own, (own, name) if len(arms) == 1 else (own,), dimension, required=False)
 
 
 def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path) -> Dataset:
@@ -172,19 +161,6 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset) -
     if kept is not None and kept.drifts and any(map(commands.has, order)):
         text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known."
         console.warn(text)
-
-
-def _beyond(
-    console: Console, loaded: Calibration, commands: Dataset, plus_minus: PlusMinus | None
-) -> dict[str, tuple[str, ...]]:
-    kept = loaded.record.prediction
-    if kept is None or not kept.ranges:
-        return {}
-    unknown = plus_minus.unknown if plus_minus else None
-    beyond, text = beyond_records(kept.ranges, commands, loaded.system.arms, unknown)
-    if text:
-        console.warn(text)
-    return {"beyond_records": tuple("1" if own else "0" for own in beyond)}
 
 
 def _half_widths(
@@ -325,16 +301,7 @@ S = TypeVar("S", bound=Settings)
 
 
 def settings_from(settings_class: type[S], texts: Sequence[str], option: str) -> S:
-    """Settings from ``key=value`` texts, whose values are YAML; a dotted key is a key of a mapping.
-
-    Args:
-        settings_class: what they must make.
-        texts: in the order given.
-        option: by which they were given, such as ``--option``, for messages.
-
-    Raises:
-        ConfigError: a text is not of that form, or the settings are refused.
-    """
+    """Settings from ``key=value`` texts, whose values are YAML; a dotted key is a key of a mapping."""
     here = Path.cwd()
     tree = Node(Origin(option, here, numbered=False), 1, {})
     for text in texts:
@@ -400,27 +367,14 @@ def export(
         request, remark = by_own_angles(request)
     exported = exporter.export(request)
     exported = replace(exported, remarks=(*exported.remarks, remark)) if remark else exported
-    exported, moved_m = _with_what_is_left_out(exporter, loaded, request, exported)
-    files = _files(out, exported, calibration)
-    (write_over if force else write_new)(unwritten(files))  # several exports may share a schema
-    _show_exported(console, request, exported, moved_m, list(files), kind)
-
-
-def _with_what_is_left_out(
-    exporter: Exporter, loaded: Calibration, request: ExportRequest, exported: Exported
-) -> tuple[Exported, float | None]:
-    """The same with the pose residual named where it is left out; how far all that is moves the tool (m)."""
-    without_residual = leaves_residual_out(exporter, request)
-    if not exported.left_out and not without_residual:
-        return exported, 0.0
+    without_residual, moved_m = leaves_residual_out(exporter, request), exported.reach
     of: Literal["everything", "residual"] = "everything" if exported.left_out else "residual"
-    moved_m = effects_reach(loaded, request, of) if exported.reach is None else exported.reach
     if without_residual:
         exported = replace(exported, left_out=(*exported.left_out, "the pose residual"))
-    return exported, moved_m
-
-
-def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes]:
+    if not exported.left_out:
+        moved_m = 0.0
+    elif moved_m is None:
+        moved_m = effects_reach(loaded, request, of)
     files = {out: exported.content}
     for name, content in exported.companions.items():
         beside = out.with_name(name)
@@ -430,7 +384,8 @@ def _files(out: Path, exported: Exported, calibration: Path) -> dict[Path, bytes
         spare_inputs(beside, calibration)
         check_output(beside)
         files[beside] = content
-    return files
+    (write_over if force else write_new)(unwritten(files))  # several exports may share a schema
+    _show_exported(console, request, exported, moved_m, list(files), kind)
 
 
 def _show_exported(
@@ -491,7 +446,12 @@ def convert(
         spare_inputs(out, source)
     registry = console.registry()
     original = load_source(source, arm, registry)
-    text, section = _sections(original, target, convention)
+    chain = rigid_chain(original.chain)
+    if target == "urdf":
+        text = urdf_text(chain, original.arm)
+        section = _yaml({"type": "urdf", "text": text})
+    else:
+        text = section = _yaml(poe_section(chain) if target == "poe" else mdh_section(chain, convention))
     off = _verified(original, section, target, registry)
     _warn_of_what_is_left(console, original, target, off)
     said = (
@@ -515,16 +475,6 @@ def convert(
     console.result({**content, "out": str(out)})
     console.line(f"{original.arm} as {target} written: {out}")
     console.line(said)
-
-
-def _sections(original: ConvertSource, target: str, convention: Convention) -> tuple[str, str]:
-    """What to write, and the section ``model:`` that reads it."""
-    chain = rigid_chain(original.chain)
-    if target == "urdf":
-        text = urdf_text(chain, original.arm)
-        return text, _yaml({"type": "urdf", "text": text})
-    section = _yaml(poe_section(chain) if target == "poe" else mdh_section(chain, convention))
-    return section, section
 
 
 def _yaml(section: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """``armcal check`` and ``armcal identify``: what is known before anything is solved."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,8 @@ import numpy as np
 from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array
 from armcal.base.config_text import finite
-from armcal.base.parameters import Parameters
 from armcal.base.units import digits, to_unit
-from armcal.cli.common import FILE, Console, data, overrides, speaking
-from armcal.cli.console import say
+from armcal.cli.common import FILE, Console, data, overrides, say, speaking
 from armcal.diagnose.fit import Prepared
 from armcal.errors import ConfigError, Location, ProblemError
 from armcal.estimate.identifiability import (
@@ -74,7 +72,10 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         f"{len(records['set_aside'])} set aside), {content['equations']} equations for "
         f"{len(parameters['free'])} free of {len(parameters['all'])} parameters."
     )
-    rows = _excitation(experiment, content["excitation_rad_or_m"])
+    rows, kinds = [], command_channels(experiment.system.arms)
+    for joint, seen in content["excitation_rad_or_m"].items():
+        unit = "deg" if kinds[joint] == "angle" else "mm"
+        rows.append((joint, *(f"{to_unit(seen[end], unit):.5g}" for end in ("min", "max")), unit, seen["levels"]))
     console.table("Excitation of the joints", ("joint", "from", "to", "unit", "levels"), rows)
     notes = (f"{finding.text} {finding.action}" for finding in ready.findings if finding.grade == "note")
     for line in (*_alignment_lines(ready.start), *notes):
@@ -96,15 +97,6 @@ def check(console: Console, config: Path, data: Path | None, overrides: tuple[st
         say(f"armcal: {refused}", err=True)
         sys.exit(refused.exit_code)
     console.out.print("Ready to run.", style="green")
-
-
-def _excitation(experiment: Experiment, excitation: dict[str, Any]) -> Iterator[tuple[Any, ...]]:
-    """How far each joint moved, in degrees or mm."""
-    arms = experiment.system.arms
-    units = {f"{a}.{j}": "deg" if kind == "angle" else "mm" for a in arms for j, kind in arms[a].commanded.items()}
-    for joint, seen in excitation.items():
-        low, high = (f"{to_unit(seen[end], units[joint]):.5g}" for end in ("min", "max"))
-        yield joint, low, high, units[joint], seen["levels"]
 
 
 def _checked(experiment: Experiment, ready: Prepared) -> dict[str, Any]:
@@ -157,7 +149,6 @@ def _alignment(start: Start) -> dict[str, Any] | None:
 
 
 def _alignment_lines(start: Start) -> list[str]:
-    """The same as people read it."""
     if start.alignment is None:
         return []
     target = ", ".join(f"{x * _MM:.1f}" for x in start.alignment.offset)
@@ -209,7 +200,13 @@ def identify(
     parameters = ready.problem.parameters
     if not parameters.free:
         raise ConfigError("no parameter is free.", where=Location(str(config)), hint="Name some under parameters.free.")
-    preferred = _preferred(parameters, prefer)
+    preferred = [parameters.select([glob]) for glob in prefer]
+    for glob, names in zip(prefer, preferred, strict=True):
+        if not any(parameters[name].free for name in names):
+            raise ConfigError(
+                f"--prefer {glob}: none of the parameters it names is free.",
+                hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
+            )
     triangle = factor_at_zero(ready.training, parameters.nominal())
     known = identify_from(triangle, parameters)
     content = _identified(experiment, ready, triangle, known)
@@ -233,17 +230,6 @@ def identify(
         _show_minimal(console, content["minimal"])
     if fixed:
         _show_fixed(console, judged)
-
-
-def _preferred(parameters: Parameters, globs: Sequence[str]) -> list[tuple[str, ...]]:
-    preferred = [parameters.select([glob]) for glob in globs]
-    for glob, names in zip(globs, preferred, strict=True):
-        if not any(parameters[name].free for name in names):
-            raise ConfigError(
-                f"--prefer {glob}: none of the parameters it names is free.",
-                hint="Name them under parameters.free as well; a minimal set is chosen from the free ones.",
-            )
-    return preferred
 
 
 def _identified(experiment: Experiment, ready: Prepared, triangle: Array, known: Identifiability) -> dict[str, Any]:
@@ -350,7 +336,6 @@ def _section(console: Console, title: str, lines: list[str]) -> None:
 
 
 def _show_fixed(console: Console, judged: FixedParameters) -> None:
-    """The table, and what to write."""
     if judged.error is not None:
         first = f"held out: {judged.error:.3g} {judged.unit} as configured; with each freed beside those above it"
         console.line(f"Fixed parameters that would explain residuals (mean error of records {first}):", "bold")

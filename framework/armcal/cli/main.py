@@ -12,7 +12,7 @@ import click
 from click.exceptions import Exit
 from click.shell_completion import CompletionItem
 
-from armcal.cli.console import Output, output_fault, say
+from armcal.cli.common import Output, output_fault, say
 from armcal.errors import EXIT_DONE, EXIT_FAULT, EXIT_INTERRUPTED, ArmcalError, BrokenPluginError
 from armcal.plugins import discover, missing_library, plugin_fault, use_plugins
 from armcal.version import JSON_SCHEMA, __version__
@@ -24,10 +24,7 @@ COMMANDS = {
     "check": ("armcal.cli.identify:check", "Everything that can be known before solving."),
     "checks": ("armcal.cli.plugins:checks", "What each run asks of its data and its fit, and how surely."),
     "identify": ("armcal.cli.identify:identify", "Which parameters the poses determine; a minimal set of them."),
-    "study": (
-        "armcal.cli.run:study",
-        "Compare model variants by cross-validated error, or trained at one load each.",
-    ),
+    "study": ("armcal.cli.run:study", "Compare model variants by cross-validated error, or trained at one load each."),
     "predict": ("armcal.cli.calibration:predict", "Where a calibrated arm goes for commanded joint angles."),
     "compensate": ("armcal.cli.calibration:compensate", "What to command so that the real arm arrives at targets."),
     "export": ("armcal.cli.calibration:export", "Write a calibrated arm in another program's format, such as URDF."),
@@ -49,11 +46,6 @@ class LazyGroup(click.Group):
         return [*COMMANDS, *_plugin_commands()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a command.
-
-        Raises:
-            PluginError: two plugins offer it.
-        """
         target, _ = COMMANDS.get(cmd_name) or _plugin_commands().get(cmd_name, ("", ""))
         if not target:
             return None
@@ -102,13 +94,11 @@ class LazyGroup(click.Group):
             ctx.exit(stated.exit_code)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Names and summaries from the table: to import every command for them takes seconds."""
         commands = {**COMMANDS, **_plugin_commands()}
         named = [CompletionItem(name, help=text) for name, (_, text) in commands.items() if name.startswith(incomplete)]
         return [*named, *click.Command.shell_complete(self, ctx, incomplete)]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Help from the table, without importing anything."""
         for title, commands in (("Commands", COMMANDS), ("Commands of plugins", _plugin_commands())):
             if commands:
                 with formatter.section(title):
@@ -116,11 +106,7 @@ class LazyGroup(click.Group):
 
 
 def _plugin_commands() -> dict[str, tuple[str, str]]:
-    """By name: where a plugin's command is, and what it does.
-
-    Raises:
-        PluginError: two plugins offer the same.
-    """
+    """By name: where a plugin's command is, and what it does."""
     registry = discover()
     names = dict.fromkeys(c.name for c in registry.components if c.kind == "command" and c.name not in COMMANDS)
     components = [registry.find("command", name) for name in names]
@@ -138,7 +124,6 @@ def cli(plugins: tuple[str, ...], disabled: tuple[str, ...]) -> None:
 
 
 def main() -> None:
-    """Entry point."""
     # One BLAS thread: sums come out the same to the last bit whatever the number of processors.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
@@ -148,10 +133,8 @@ def main() -> None:
     code = _exit_code()
     if sys.stdout is not None:
         sys.stdout.flush()
-        if (fault := output_fault()) is not None and fault.errno not in (
-            errno.EPIPE,
-            errno.EIO,
-        ):  # else a reader that went away
+        fault = output_fault()
+        if fault is not None and fault.errno not in (errno.EPIPE, errno.EIO):  # else a reader that went away
             say(f"armcal: standard output cannot be written ({fault.strerror}).", err=True)
             code = code or EXIT_FAULT
     sys.exit(code)

@@ -1,17 +1,44 @@
 """``armcal new`` and ``armcal demo``: files to begin with."""
 
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from armcal.cli.common import FILE, Console, speaking, unwritten
-from armcal.errors import InputError, Location
+from armcal import scaffold
+from armcal.base.units import from_unit, parse_quantity
+from armcal.cli.common import FILE, Console, command_line, say, speaking, unwritten
+from armcal.cli.run import run
+from armcal.errors import EXIT_FAULT, EXIT_NOT_CONVERGED, ConfigError, InputError, Location
 from armcal.io.plain_files import write_new, writing
+from armcal.measure.tables import is_number
+from armcal.plugins import PluginRegistry
 from armcal.scaffold.plugin_files import KINDS, plugin_name, write_plugin
+from armcal.scaffold.robot import (
+    MOST,
+    NOISE_ALONE_MM,
+    RESULTS,
+    WIDTHS,
+    Convention,
+    Robot,
+    Unit,
+    read_rows,
+    robot_name,
+    robot_of_rows,
+    robot_of_urdf,
+    try_out,
+    write_robot,
+)
 from armcal.version import SOURCES
 
 _CONFIG = "demo.yaml"
+CONVENTIONS: dict[str, Convention] = {"standard": "standard", "modified": "craig"}
+SKELETONS = {path.stem: path for path in sorted(Path(scaffold.__file__).with_name("skeletons").glob("*.csv"))}
+"""Rows of arms that many people have, in round numbers, by the name that begins one."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -64,9 +91,112 @@ def new_robot(console: Console, name: str, out: Path | None, **source: Any) -> N
 
     Give --dh with --convention, or --urdf; a robot called so101 has rows to begin with.
     """
-    from armcal.cli.new_robot import begin  # all of the solver, which a plugin's files do without
+    folder, registry = out or Path(name), console.registry()
+    robot = _described(robot_name(name), source, registry)
+    up = direction(source["up"]) if source["up"] else robot.up
+    robot = replace(robot, up=up, target=place(source["target"]) if source["target"] else robot.target)
+    stated = {unit: source[f"prior_{unit}"] for unit in WIDTHS}
+    widths: dict[Unit, float] = {unit: WIDTHS[unit] if width is None else width for unit, width in stated.items()}
+    for unit, width in widths.items():
+        if not 0 < width < math.inf:
+            hint = f"Give how far the robot may well be off its file (standard deviation, {unit})."
+            raise ConfigError(f"found --prior-{unit} {width:g}, expected more than 0.", hint=hint)
+    choice = write_robot(replace(robot, widths=widths), folder, registry)
+    with console.progress() as progress:
+        trial = try_out(folder, registry, command_line(), progress)
+    result = {
+        "robot": robot.name,
+        "out": str(folder),
+        "free": list(choice.kept),
+        "redundant": [dropped.name for dropped in choice.redundant],
+        "holdout_nominal_mm": trial.nominal_mm,
+        "holdout_calibrated_mm": trial.calibrated_mm,
+        "noise_alone_mm": NOISE_ALONE_MM,
+        "verdict": trial.result.verdict.headline,
+        "works": not trial.fault,
+    }
+    console.result(result)
+    for text in trial.result.warnings:
+        console.warn(text)
+    console.line(f"{robot.name}: {len(robot.joints)} joints, {len(choice.deviations)} free parameters, in {folder}")
+    if robot.name in SKELETONS and not (source["dh"] or source["urdf"]):
+        console.line(f"{robot.name} is a skeleton of round numbers: correct arm.yaml, or begin with --urdf FILE")
+    for note in robot.notes:
+        console.line(f"{source['urdf']}: {note}")
+    assumed = [joint.name for joint in robot.joints if joint.assumed]
+    if assumed:
+        console.line(f"limits were assumed for {', '.join(assumed)}: correct them in plan.yaml before the arm moves")
+    console.line(
+        f"held-out tips of simulated records: nominal {trial.nominal_mm:.3f} mm, calibrated "
+        f"{trial.calibrated_mm:.3f} mm (the noise alone: {NOISE_ALONE_MM:.3f} mm)"
+    )
+    findings = [f for f in trial.result.verdict.findings if f.grade in ("bad", "warning")]
+    for finding in findings:
+        console.line(f"{finding.grade}: {finding.text}")
+    console.line(trial.result.verdict.headline)
+    console.line(f"report: {folder / RESULTS / 'report.html'}; next: {folder / 'README.md'}")
+    if trial.fault:
+        say(f"armcal: {folder}: the calibration of simulated records failed: {trial.fault}.", err=True)
+        sys.exit(EXIT_FAULT if trial.result.estimate.verdict.converged else EXIT_NOT_CONVERGED)
 
-    begin(console, name, source, out or Path(name))
+
+def _described(name: str, given: Mapping[str, Any], registry: PluginRegistry) -> Robot:
+    dh, urdf, convention = (given[key] for key in ("dh", "urdf", "convention"))
+    if dh and urdf:
+        raise ConfigError("found both --dh and --urdf, expected one of them.", hint="Leave one out.")
+    if given["tip"] and not urdf:
+        raise ConfigError("found --tip without --urdf.", hint="Give --urdf FILE, or leave it out.")
+    if convention and not dh:
+        raise ConfigError("found --convention without --dh.", hint="Give --dh FILE, or leave it out.")
+    if urdf:
+        return robot_of_urdf(name, urdf, given["tip"], registry)
+    if not dh and name in SKELETONS:
+        return robot_of_rows(name, "standard", read_rows(SKELETONS[name], registry))
+    if not dh:
+        raise ConfigError(
+            f"found no description of the robot {name}, expected a file of it, or the name of a known skeleton "
+            f"({', '.join(SKELETONS)}).",
+            hint="Give --dh FILE with --convention, or --urdf FILE.",
+        )
+    if convention is None:
+        raise ConfigError(
+            "found --dh without --convention: two go by the same name.",
+            hint="Give --convention standard, Rot_z(theta) Trans_z(d) Trans_x(a) Rot_x(alpha), or modified, "
+            "Rot_x(alpha) Trans_x(a) Rot_z(theta) Trans_z(d).",
+        )
+    return robot_of_rows(name, CONVENTIONS[convention], read_rows(dh, registry))
+
+
+def direction(text: str) -> tuple[float, float, float]:
+    """A unit vector from ``z``, ``-y`` or ``0.1,0,0.99``."""
+    sign, axis = (-1.0, text[1:]) if text.startswith("-") else (1.0, text)
+    if axis in ("x", "y", "z"):
+        return sign * (axis == "x"), sign * (axis == "y"), sign * (axis == "z")
+    parts = [part.strip() for part in text.split(",")]
+    numbers = [float(part) for part in parts if is_number(part)]
+    length = math.hypot(*numbers)
+    if len(numbers) != len("xyz") or len(parts) != len("xyz") or not 0 < length < math.inf:
+        raise ConfigError(
+            f"found {text!r} for up, expected x, y, z, -x, -y, -z or three numbers such as 0.02,0,0.9998.",
+            hint="Give the direction in the tracker's base frame that points away from the ground.",
+        )
+    x, y, z = (number / length for number in numbers)
+    return x, y, z
+
+
+def place(text: str) -> tuple[float, float, float]:
+    """A point (m) from ``30,0,12.5`` in mm, or with units: ``3 cm, 0, 12.5 mm``."""
+    try:
+        parts = [part.strip() for part in text.split(",")]
+        x, y, z = (from_unit(float(p), "mm") if is_number(p) else parse_quantity(p, "length") for p in parts)
+        if not all(abs(value) <= MOST["length"] for value in (x, y, z)):
+            raise ValueError(f"{text} is longer than an arm")
+    except ValueError as fault:
+        raise ConfigError(
+            f"found {text!r} for the target, expected three lengths such as 30,0,12.5 (mm) or 3 cm,0,0.",
+            hint="Give the target's place in the frame of the last row, or of the URDF's tip.",
+        ) from fault
+    return x, y, z
 
 
 @click.command()
@@ -101,8 +231,6 @@ def demo(ctx: click.Context, console: Console, name: str, out: Path | None) -> N
         write_new(missing)
     results = folder / "results"
     console.line(f"the files of {name} are in {folder}; armcal run {folder / _CONFIG} --out {results}")
-    from armcal.cli.run import run  # all of the solver
-
     spoken = {"--json": console.json, "-q": console.quiet, "-v": console.verbose}
     options = [option for option, is_given in spoken.items() if is_given]
     arguments = [str(folder / _CONFIG), "--out", str(results), *options]

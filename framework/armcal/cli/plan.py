@@ -25,8 +25,7 @@ from armcal.measure.measurement import borrowed_names
 from armcal.problem.problem import Problem
 from armcal.report.document import Document, Section, Table
 from armcal.run.experiment import Experiment, PlanSettings
-from armcal.run.plan import NAMES, POINTS, PlanResult, make_iso_plan, make_plan
-from armcal.run.plan_poses import counts_text, read_poses, stated_beyond
+from armcal.run.plan import NAMES, POINTS, PlanResult, counts_text, make_iso_plan, make_plan, read_poses, stated_beyond
 
 _SHOWN = 8
 _LARGEST_CUBE_MM = 10_000.0
@@ -87,11 +86,7 @@ def plan(
 
 
 def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
-    """The edge of the cube (m); None for the largest, or where none is planned.
-
-    Raises:
-        InputError: neither poses nor a cube are asked for, both are, or the size is none.
-    """
+    """The edge of the cube (m); None for the largest, or where none is planned."""
     text = given["iso_cube"]
     if (text is None) == (count is None):
         raise InputError("give --poses N to calibrate, or --iso-cube SIZE_MM to test; one of them.")
@@ -112,11 +107,10 @@ def _edge(given: Mapping[str, Any], count: int | None) -> float | None:
     return size / 1000
 
 
-def _planned(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
-    """For JSON."""
+def _plan_document(experiment: Experiment, result: PlanResult) -> Document:
     pool, parameters = result.pool, experiment.parameters
     units = [block.unit for block in parameters.coordinate_blocks]
-    return {
+    data: dict[str, Any] = {
         "experiment": experiment.name,
         "poses": len(result.dataset),
         "ids": list(result.dataset.ids),
@@ -141,10 +135,6 @@ def _planned(experiment: Experiment, result: PlanResult) -> dict[str, Any]:
         "weakest": str(result.identifiability.weakest),
         "visit": {"order": (experiment.settings.plan or PlanSettings()).order, "travel_s": result.travel_s},
     }
-
-
-def _plan_document(experiment: Experiment, result: PlanResult) -> Document:
-    data, pool = _planned(experiment, result), result.pool
     omitted = f" ({counts_text(pool.left_out)} left out)" if pool.left_out else ""
     given = f" after {result.given} given records" if result.given else ""
     moved = f"; {result.refined} of the plan moved on from there" if result.refined else ""
@@ -223,7 +213,14 @@ def simulate(
     spare_inputs(out, poses)
     registry = console.registry()
     experiment = Experiment.load(config, overrides, registry=registry)
-    dataset = _simulated(experiment, poses)
+    listed = None if poses is None else read_poses(experiment, poses)
+    dataset = experiment.simulator().simulate(replace(experiment.simulation_request, poses=listed))
+    if listed is not None and dataset.ids != listed.ids:
+        raise ConfigError(
+            f"the simulator made {len(dataset)} records of its own, expected the {len(listed)} poses of {poses}.",
+            where=experiment.source.where(("simulation", "type")),
+            hint="Leave --poses out, or use the simulator elastic_arm.",
+        )
     if images is not None:
         with console.progress() as progress:
             dataset = _with_images(experiment, dataset, images, progress)
@@ -235,34 +232,8 @@ def simulate(
         console.out.print(f"next: armcal run {config} {reading} --out DIR", soft_wrap=True)
 
 
-def _simulated(experiment: Experiment, poses: Path | None) -> Dataset:
-    """Records as the configured simulator makes them, at the poses of a file if one is given.
-
-    Raises:
-        ConfigError: no simulator is configured, or it does not take poses.
-        DataError: the poses are refused.
-    """
-    listed = None if poses is None else read_poses(experiment, poses)
-    dataset = experiment.simulator().simulate(replace(experiment.simulation_request, poses=listed))
-    if listed is not None and dataset.ids != listed.ids:
-        raise ConfigError(
-            f"the simulator made {len(dataset)} records of its own, expected the {len(listed)} poses of {poses}.",
-            where=experiment.source.where(("simulation", "type")),
-            hint="Leave --poses out, or use the simulator elastic_arm.",
-        )
-    return dataset
-
-
 def _with_images(experiment: Experiment, dataset: Dataset, folder: Path, progress: Progress) -> Dataset:
-    """Simulated records with a file of an image each, in place of what was read of it.
-
-    Of several cameras each has a folder of its own name.
-
-    Raises:
-        ConfigError: no measurement draws images, or the simulator does not say what is true.
-        InputError: the images cannot be written.
-        PluginError: a library is not there.
-    """
+    """Simulated records with a file of an image each, in place of what was read of it; a folder for each camera."""
     simulator, cameras = experiment.simulator(), experiment.system.measurements
     drawing = {name: m for name, m in cameras.items() if isinstance(m, Rendering)}
     if not drawing or not isinstance(simulator, TruthfulSimulator):

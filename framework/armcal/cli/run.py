@@ -5,8 +5,7 @@ from pathlib import Path
 
 import click
 
-from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, speaking
-from armcal.cli.console import say
+from armcal.cli.common import FILE, Console, command_line, data, overrides, parallel, say, speaking
 from armcal.errors import EXIT_DO_NOT_USE, EXIT_NOT_CONVERGED
 from armcal.estimate.estimator import CHECK_THE_DATA
 from armcal.io.parallel import Executor

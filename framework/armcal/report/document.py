@@ -27,21 +27,16 @@ class Table:
 
 @dataclass(frozen=True)
 class Marks:
-    """Points, or a line that breaks where a number is not known.
+    """Points, or a line that breaks where a number is not known."""
 
-    ``style`` is of the stylesheet: of points it begins with ``dot``. ``texts`` stand at the points instead.
-    """
-
-    style: str
+    style: str  # of the stylesheet; of points it begins with ``dot``
     xy: Array | tuple[Array, Array]  # 2 x N
     name: str = ""  # in the legend
-    texts: Sequence[str] = ()
+    texts: Sequence[str] = ()  # at the points instead
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes."""
-
     title: str
     marks: Sequence[Marks]
     x: str = ""  # what it is, with its unit
@@ -68,9 +63,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Code:
-    """Text that keeps its lines."""
-
-    text: str
+    text: str  # keeps its lines
 
 
 Part: TypeAlias = str | Finding | Table | Figure | Code
@@ -78,23 +71,14 @@ Part: TypeAlias = str | Finding | Table | Figure | Code
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a page, and where ``level`` says so of a terminal's answer: one heading, parts in order.
+    """A section of a page, and where ``level`` says so of a terminal's answer: one heading, parts in order."""
 
-    Attributes:
-        title: its heading, plain text.
-        html: HTML before the parts. It needs no other file and no script, since the page must open offline.
-        parts: sentences, findings, tables and figures.
-        name: where links go.
-        folded: whether the page shows only the heading until it is opened; it is not printed then.
-        level: whether a terminal shows it ``always``, when ``verbose``, or only a ``page`` does.
-    """
-
-    title: str
-    html: str = ""
-    parts: Sequence[Part] = ()
-    name: str = ""
-    folded: bool = False
-    level: Level = "page"
+    title: str  # its heading, plain text
+    html: str = ""  # before the parts; without other files and scripts, since the page must open offline
+    parts: Sequence[Part] = ()  # sentences, findings, tables and figures
+    name: str = ""  # where links go
+    folded: bool = False  # whether the page shows only the heading until it is opened; it is not printed then
+    level: Level = "page"  # whether a terminal shows it ``always``, when ``verbose``, or only a ``page`` does
 
 
 ReportSection = Section  # what plugins call it
@@ -102,15 +86,12 @@ ReportSection = Section  # what plugins call it
 
 @dataclass(frozen=True)
 class Document:
-    """What there is to say of a result.
-
-    ``grade`` (bad, warning, note or good) is that of the headline.
-    """
+    """What there is to say of a result."""
 
     title: str
     headline: str
     sections: Sequence[Section]
-    grade: str = "note"
+    grade: str = "note"  # of the headline: bad, warning, note or good
     summary: Sequence[Part] = ()  # below the headline, on a page and a terminal
     picture: Figure | None = None  # before the headline, on a page
     data: Mapping[str, Any] = field(default_factory=dict)  # for JSON

@@ -6,9 +6,7 @@ Drawn here and not by matplotlib: importing that alone would lengthen a run of t
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -70,20 +68,19 @@ def nice_step(rough: float, steps: Sequence[float] = (1, 2, 5, 10, 20)) -> float
 
 def drawn(figure: Figure, ident: str) -> list[Markup]:
     """Each panel of a figure; ``ident`` is unique on the page."""
-    return [_panel(figure, panel, f"{ident}-{i}") for i, panel in enumerate(figure.panels)]
-
-
-def _panel(figure: Figure, panel: Panel, ident: str) -> Markup:
-    x, y, bottom = _axes(panel)
-    parts = [] if panel.bare else _frame(panel, x, y)
-    for marks in panel.marks:
-        parts.append(_marks(marks, x, y))
-    title = f"{figure.title}: {panel.title}" if panel.title else figure.title
-    return Markup(
-        f'<svg role="img" aria-labelledby="{escape(ident)}-t {escape(ident)}-d" '
-        f'viewBox="0 0 {WIDTH:.0f} {bottom:.0f}"><title id="{escape(ident)}-t">{escape(title)}</title>'
-        f'<desc id="{escape(ident)}-d">{escape(figure.said)}</desc>{"".join(parts)}</svg>'
-    )
+    panels = []
+    for i, panel in enumerate(figure.panels):
+        x, y, bottom = _axes(panel)
+        parts = [*([] if panel.bare else _frame(panel, x, y)), *(_marks(marks, x, y) for marks in panel.marks)]
+        title, name = f"{figure.title}: {panel.title}" if panel.title else figure.title, escape(f"{ident}-{i}")
+        panels.append(
+            Markup(
+                f'<svg role="img" aria-labelledby="{name}-t {name}-d" viewBox="0 0 {WIDTH:.0f} {bottom:.0f}">'
+                f'<title id="{name}-t">{escape(title)}</title><desc id="{name}-d">{escape(figure.said)}</desc>'
+                f"{''.join(parts)}</svg>"
+            )
+        )
+    return panels
 
 
 def _axes(panel: Panel) -> tuple[Axis, Axis, float]:
@@ -126,7 +123,6 @@ def _ends(values: Array, log: bool) -> tuple[float, float]:
 
 
 def _frame(panel: Panel, x: Axis, y: Axis) -> list[str]:
-    """Grid, ticks and labels."""
     top, bottom = min(y.start, y.end), max(y.start, y.end)
     parts = []
     for at, label in x.ticks(5):
@@ -177,17 +173,11 @@ _SYMBOLS = {"bad": "✕", "warning": "!", "note": "i", "good": "✓"}
 
 
 def page(document: Document) -> str:
-    content = {"document": document, "version": __version__, "words": _WORDS, "symbols": _SYMBOLS}
-    return str(_template().render(content))
-
-
-@lru_cache(maxsize=1)
-def _template() -> Any:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.lstrip_blocks = True
     environment.tests["a"] = lambda part, kind: type(part).__name__ == kind
-    environment.globals["drawn"] = drawn
-    return environment.get_template("page.html.j2")
+    content = {"document": document, "version": __version__, "words": _WORDS, "symbols": _SYMBOLS, "drawn": drawn}
+    return environment.get_template("page.html.j2").render(content)

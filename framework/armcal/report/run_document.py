@@ -74,14 +74,26 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
     summary: list[Part] = list(filter(None, ("" if verdict.bad else verdict.claim, verdict.next_poses)))
     if findings and not urgent:
         summary.append("No warning: the calibration can be used.")
+    worst = worst_records(result)
+    large = worst_table(result, worst) if len(worst) else None
     own = [
         *_accuracy(result),
         *_parameters(result),
-        *_records(result),
+        Section("What was learned beside the model", parts=_some(moved_table(result)), name="pose-residual"),
+        Section("Where residuals come from", parts=_some(against_joints(result)), name="joints"),
+        Section("Record by record", parts=_some(in_order(result, worst)), name="records"),
+        Section("Largest errors", parts=_some(large), name="worst", folded=True),
         Section("Notes", parts=notes, name="notes", level="verbose"),
         Section(f"{plural(len(passed), 'check')} passed", parts=passed, name="passed", folded=True, level="verbose"),
-        *_determined(result.estimate),
-        *_data(result, warnings),
+        _determined(result.estimate),
+        Section(
+            "Warnings of the data and the configuration",
+            parts=[Finding("warning", text) for text in warnings],
+            name="warnings",
+        ),
+        Section("Suspicious records", parts=_some(suspicious_table(result)), name="suspicious", level="verbose"),
+        Section("Variance components", parts=_some(scatter_table(result)), name="components"),
+        Section("Records set aside", parts=_some(aside_table(result)), name="data", level="verbose"),
         *sections,
         _origin(result),
     ]
@@ -155,23 +167,7 @@ def _some(*parts: Part | None) -> list[Part]:
     return [part for part in parts if part is not None]
 
 
-def _records(result: RunResult) -> list[Section]:
-    worst = worst_records(result)
-    listed = _some(worst_table(result, worst)) if len(worst) else []
-    moved = _some(moved_table(result))
-    return [
-        Section("What was learned beside the model", parts=moved, name="pose-residual"),
-        Section("Where residuals come from", parts=_some(against_joints(result)), name="joints"),
-        Section(
-            "Record by record",
-            parts=_some(in_order(result, worst)),
-            name="records",
-        ),
-        Section("Largest errors", parts=listed, name="worst", folded=True),
-    ]
-
-
-def _determined(estimate: Estimate) -> list[Section]:
+def _determined(estimate: Estimate) -> Section:
     """What the data hardly determine, or not: combinations of parameters, and pairs that are correlated."""
     known, names = estimate.identifiability, estimate.names
     parts: list[Part] = [f"{determined_in_words(estimate.sources)}."]
@@ -192,19 +188,7 @@ def _determined(estimate: Estimate) -> list[Section]:
         shown = [(a, b, fixed(r, 3, signed=True)) for a, b, r in (*pairs[:MOST_LISTED], *others)]
         caption = f"Pairs that correlate by more than {CORRELATED:g} ({count(len(pairs))}), then the strongest others"
         parts.append(Table(caption, ("Parameter", "Parameter", "Correlation"), shown, left=("Parameter",)))
-    return [Section("What the data do not tell apart", parts=parts, name="determined", folded=not known.undetermined)]
-
-
-def _data(result: RunResult, warnings: Sequence[str]) -> list[Section]:
-    suspicious, scatter = _some(suspicious_table(result)), _some(scatter_table(result))
-    findings = [Finding("warning", text) for text in warnings]
-    aside = _some(aside_table(result))
-    return [
-        Section("Warnings of the data and the configuration", parts=findings, name="warnings"),
-        Section("Suspicious records", parts=suspicious, name="suspicious", level="verbose"),
-        Section("Variance components", parts=scatter, name="components"),
-        Section("Records set aside", parts=aside, name="data", level="verbose"),
-    ]
+    return Section("What the data do not tell apart", parts=parts, name="determined", folded=not known.undetermined)
 
 
 def _origin(result: RunResult) -> Section:
@@ -274,7 +258,10 @@ def in_space(result: RunResult) -> Figure | None:
     places = np.flatnonzero(np.isfinite([*position[:3], *shown.values()]).all(axis=0))
     if not len(places):
         return None
-    ends = _levels(np.concatenate([own[places] for own in shown.values()]))
+    # Bounds of the colours, evenly in the logarithm.
+    some = np.concatenate([own[places] for own in shown.values()])
+    low, high = (np.percentile(some[some > 0], p) for p in (2, 98)) if (some > 0).any() else (0.1, 1.0)
+    ends = np.geomspace(low, max(high, 1.2 * low), _LEVELS + 1)[1:-1]
     chosen = _thinned(next(reversed(shown.values())), places)
     box, flat = _box(position[:3, places]), _projected(position[:3, chosen])
     small = " small" if len(chosen) > 600 else ""
@@ -290,13 +277,6 @@ def in_space(result: RunResult) -> Figure | None:
     caption = f"Places of the tip, {', '.join(spans)} mm, and the error of each record, {unit}, by one scale."
     caption += drawn_of(len(chosen), len(places))
     return Figure("Error by place", f"{plural(len(places), 'tip position')}; {said}.", caption, panels)
-
-
-def _levels(numbers: Array) -> Array:
-    """Bounds of the colours, evenly in the logarithm."""
-    some = numbers[numbers > 0]
-    low, high = (np.percentile(some, p) for p in (2, 98)) if len(some) else (0.1, 1.0)
-    return np.asarray(np.geomspace(low, max(high, 1.2 * low), _LEVELS + 1)[1:-1])
 
 
 def _range(ends: Array, level: int, unit: str) -> str:
@@ -505,15 +485,10 @@ def errors_table(caption: str, errors: ErrorTable) -> Table:
         if key in errors.calibrated and errors.calibrated[key].count:
             shown += [(words, model, own[key]) for model, own in models if key in own]
     decimals = common_decimals((x for _, _, s in shown for x in (s.mean, s.max)), most=3)
-    rows = [
-        (
-            words if model == "nominal" else "",
-            count(own.count) if model == "nominal" else "",
-            model,
-            *(fixed(x, decimals) for x in (own.mean, own.rms, own.p95, own.max)),
-        )
-        for words, model, own in shown
-    ]
+    rows = []
+    for words, model, own in shown:
+        first = (words, count(own.count)) if model == "nominal" else ("", "")
+        rows.append((*first, model, *(fixed(x, decimals) for x in (own.mean, own.rms, own.p95, own.max))))
     strong = [i for i, (_, model, _) in enumerate(shown) if model == "calibrated"]
     headings = ("Records", "Count", "Arm", "Mean", "RMS", "95 %", "Max")
     return Table(caption, headings, rows, left=("Arm",), strong=strong)
@@ -571,7 +546,6 @@ def _span(factor: float, digits: int, lower: float, upper: float) -> str:
 
 
 def principal_table(estimate: Estimate) -> Table | None:
-    """Eigenvalues of compliances that are matrices."""
     factor, unit = shown_unit("rad_per_Nm")
     rows = []
     for block in estimate.parameters.free:
@@ -612,7 +586,6 @@ def worst_table(result: RunResult, worst: Indices) -> Table:
 
 
 def moved_table(result: RunResult) -> Table | None:
-    """How far the pose residual moves the tool, by part."""
     outcome = result.pose_residual
     if outcome is None or outcome.moved is None:
         return None
@@ -625,19 +598,11 @@ def moved_table(result: RunResult) -> Table | None:
 
 
 def suspicious_table(result: RunResult) -> Table | None:
-    suspicious, unit = result.suspicious, result.errors.unit
-    rows = [
-        (
-            s.record_id,
-            str(s.row or NONE),
-            s.measurement,
-            fixed(s.deviations, 1),
-            fixed(s.limit, 1),
-            fixed(s.error_mm, 2),
-            "set aside" if s.weight == 0 else f"weight {s.weight:.2g}",
-        )
-        for s in suspicious[:MOST_LISTED]
-    ]
+    suspicious, unit, rows = result.suspicious, result.errors.unit, []
+    for s in suspicious[:MOST_LISTED]:
+        numbers = (fixed(s.deviations, 1), fixed(s.limit, 1), fixed(s.error_mm, 2))
+        weight = "set aside" if s.weight == 0 else f"weight {s.weight:.2g}"
+        rows.append((s.record_id, str(s.row or NONE), s.measurement, *numbers, weight))
     caption = f"{count(len(suspicious))} suspicious records, farther from the fit than noise allows (1 % over all"
     caption += f"); loss {result.noise['loss']}" + _more(len(suspicious), "in residuals.csv")
     headings = ("Record", "Source row", "Measurement", "Distance, sd", "Limit, sd", f"Error, {unit}", "In the fit")
@@ -671,7 +636,6 @@ def scatter_table(result: RunResult) -> Table | None:
 
 
 def provenance_facts(provenance: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Names and values, those of mappings one by one."""
     facts: list[tuple[str, str]] = []
     for key, value in provenance.items():
         name = f"{prefix}{key}".replace("_", " ")

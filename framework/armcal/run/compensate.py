@@ -1,6 +1,6 @@
 """From a file of targets to a file of commands: where they lead, how sure that is, and what nominal ones would do."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -33,11 +33,9 @@ from armcal.measure.checks import noticed, records_of
 from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels, surroundings
 from armcal.plugins import PluginRegistry
-from armcal.run.plan_poses import options_within
+from armcal.run.plan import options_within
 
 _WORTH_COMPILING = 5000  # From this many targets on, waiting for the compiler costs less than doing without it
-Column = tuple[str, tuple[str, ...]]
-_ENGLISH = {False: "no", True: "yes"}
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _RPY = ("roll", "pitch", "yaw")
 _NORM = 1e-3
@@ -47,35 +45,6 @@ _AS_DOCUMENTED = (
     "between them and decimal points."
 )
 _KINDS = {"quaternion": _QUATERNION, "angles": _RPY}
-
-
-def read_targets(path: Path, expression: ToolExpression, registry: PluginRegistry) -> tuple[Targets, Dataset]:
-    """Targets of one arm; and the file's content: ids, columns that nothing asked for, rows set aside.
-
-    Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``; for a
-    rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y, then z).
-    Load, gravity, surroundings and approach stand as in measured data.
-    """
-    dataset = _read(path, expression, registry)
-    if not len(dataset):
-        raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
-    acting = np.repeat(expression.defaults[:, None], len(dataset), axis=1)
-    for i, channel in enumerate(expression.channels):
-        name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
-        if channel not in expression.joints and dataset.has(name):
-            acting[i] = dataset.column(name)
-    positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
-    row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
-    if abs(positions[row, axis]) > FARTHEST_M:
-        raise DataError(
-            f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
-            where=Location(str(path), line=_line(dataset, int(row)), field="xyz"[axis]),
-            hint="Check the number and the unit in the column's name.",
-        )
-    joints = len(expression.joints)
-    loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
-    conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
-    return Targets(positions, _rotations(path, dataset), loads, approaches, conditions), dataset
 
 
 def check_units(path: Path, targets: Targets, reach: Reach) -> None:
@@ -116,10 +85,6 @@ def _read(path: Path, expression: ToolExpression, registry: PluginRegistry) -> D
     return replace(dataset, warnings=(*dataset.warnings, text))
 
 
-def _line(dataset: Dataset, row: int) -> int:
-    return dataset.rows[row] if dataset.rows else row + 1
-
-
 def _rotations(path: Path, dataset: Dataset) -> Array | None:
     present = {kind: [name for name in names if dataset.has(name)] for kind, names in _KINDS.items()}
     given = [kind for kind, columns in present.items() if columns]
@@ -145,9 +110,10 @@ def _rotations(path: Path, dataset: Dataset) -> Array | None:
     norms = np.linalg.norm(stacked, axis=0)
     bad = np.flatnonzero(np.abs(norms - 1) > _NORM)
     if bad.size:
+        line = dataset.rows[bad[0]] if dataset.rows else int(bad[0]) + 1
         raise DataError(
             f"its quaternion has the norm {norms[bad[0]]:.4g}, expected 1.",
-            where=Location(str(path), line=_line(dataset, int(bad[0])), field=", ".join(_QUATERNION)),
+            where=Location(str(path), line=line, field=", ".join(_QUATERNION)),
             hint="Give unit quaternions, the real part first.",
         )
     return np.stack([rotation_matrix(q) for q in (stacked / norms).T])
@@ -157,7 +123,7 @@ def _rotations(path: Path, dataset: Dataset) -> Array | None:
 class Bench:
     """An arm of a calibration, where it may go and how its commands are chosen."""
 
-    calibration: Calibration  # as loaded
+    calibration: Calibration
     arm: str  # its instance name
     options: Options  # of compensation, with where it may go
     target: MeasuredPoint | None  # what its instrument reads, if it reads a point of the tool
@@ -185,16 +151,39 @@ class Bench:
         return self.point == "target" or self.target is None or not self.target.fitted
 
     def read(self, path: Path, registry: PluginRegistry) -> tuple[Targets, Dataset]:
-        """Targets from a CSV, see ``read_targets``."""
-        conditions = self.calibration.system.arms[self.arm].conditions
-        targets, dataset = read_targets(path, self.calibration.expression(self.arm, conditions), registry)
+        """Targets from a CSV; and the file's content: ids, columns that nothing asked for, rows set aside.
+
+        Columns ``x_mm, y_mm, z_mm``, or ``target_x_mm`` and so on, which alone counts where a joint is called ``x``;
+        for a rotation too ``qw, qx, qy, qz`` or ``roll_deg, pitch_deg, yaw_deg`` (about the base frame's x, then y,
+        then z). Load, gravity, surroundings and approach stand as in measured data.
+        """
+        expression = self.calibration.expression(self.arm, self.calibration.system.arms[self.arm].conditions)
+        dataset = _read(path, expression, registry)
+        if not len(dataset):
+            raise DataError("it has no targets.", where=Location(str(path)), hint="Give a row for each target.")
+        acting = np.repeat(expression.defaults[:, None], len(dataset), axis=1)
+        for i, channel in enumerate(expression.channels):
+            name = f"{expression.name}.{channel}" if channel.startswith(APPROACH) else channel
+            if channel not in expression.joints and dataset.has(name):
+                acting[i] = dataset.column(name)
+        positions = np.stack([dataset.column(axis) for axis in "xyz"], axis=1)
+        row, axis = np.unravel_index(np.abs(positions).argmax(), positions.shape)
+        if abs(positions[row, axis]) > FARTHEST_M:
+            raise DataError(
+                f"found {positions[row, axis]:g} m, expected a place that an arm could have.",
+                where=Location(str(path), line=dataset.rows[row] if dataset.rows else int(row) + 1, field="xyz"[axis]),
+                hint="Check the number and the unit in the column's name.",
+            )
+        joints = len(expression.joints)
+        loads, approaches = acting[2 * joints : 2 * joints + len(LOAD_CHANNELS)], acting[joints : 2 * joints]
+        conditions = {name: dataset.column(name) for name in expression.arm.conditions if dataset.has(name)}
+        targets = Targets(positions, _rotations(path, dataset), loads, approaches, conditions)
         self.calibration.require_payload(dataset.has("payload"), str(path))
         return targets, dataset
 
     def compensator(self, targets: Targets | None = None) -> Compensator:
-        """What finds commands, for targets that state such surroundings."""
-        conditions = () if targets is None else tuple(targets.conditions)
         choice: EvaluatorChoice = "compiled" if targets is not None and len(targets) >= _WORTH_COMPILING else "auto"
+        conditions = () if targets is None else tuple(targets.conditions)
         try:
             expression = self.calibration.expression(self.arm, conditions, self.point)
             return Compensator(expression, self.calibration.parameters, self.options, choice)
@@ -229,7 +218,6 @@ class Answer:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The commands as records, whose ids count them."""
         name, joints, commands = self.compensator.expression.name, self.compensator.joints, self.commands
         channels: dict[str, Array] = {f"{name}.{joint}": commands.joint_angles[:, i] for i, joint in enumerate(joints)}
         channels |= {f"{name}.{APPROACH}{joint}": commands.approach[:, i] for i, joint in enumerate(joints)}
@@ -281,69 +269,54 @@ def write_commands(path: Path, answer: Answer, given: Dataset, angle_unit: str, 
 
     Loads and surroundings are written where the targets state them, approaches where they are known.
     """
-    compensator, commands = answer.compensator, answer.dataset.channels
-    arm, name = compensator.expression.arm, compensator.expression.name
+    compensator, commands, targets = answer.compensator, answer.commands, answer.targets
+    arm, name, joints = compensator.expression.arm, compensator.expression.name, compensator.joints
     channels = {
         channel: values
-        for channel, values in commands.items()
-        if (not for_nominal and channel.removeprefix(f"{name}.") in compensator.joints)
+        for channel, values in answer.dataset.channels.items()
+        if (not for_nominal and channel.removeprefix(f"{name}.") in joints)
         or (given.has(channel) if channel in LOAD_CHANNELS else "." not in channel)
         or (not for_nominal and APPROACH in channel and values.any())
     }
+    extra: dict[str, tuple[str, ...]] = {}
+    if for_nominal:  # poses that the controller is sent, and how far the targets are shifted and turned to these
+        poses = sent(answer.bench.nominal, commands)
+        extra |= _pose("", poses)
+        for axis, shifts in zip("xyz", poses[:, :3, 3].T - targets.positions.T, strict=True):
+            extra[f"d{axis}_mm"] = _exact(1000 * shifts)
+        if targets.rotations is not None:
+            for axis, turns in zip("xyz", turn_between(targets.rotations, poses[:, :3, :3]).T, strict=True):
+                extra[f"turn_{axis}_rad"] = _exact(turns)
+    elif commands.counts is not None:
+        for joint, counts in zip(joints, commands.counts.T, strict=True):
+            if joint in compensator.expression.servos:
+                extra[f"{joint}_counts"] = tuple(str(count) for count in counts)
+                extra[f"{joint}_pulse_us"] = short_texts(1e6 * compensator.expression.servos[joint][1].tick * counts)
+    extra["reached"] = tuple("yes" if reached else "no" for reached in commands.reached)
+    extra |= _pose("tool_", commands.base_T_tool)
+    extra["error_mm"] = short_texts(1000 * commands.distances)
+    extra["error_deg"] = short_texts(np.asarray(np.degrees(commands.turns)))
+    if answer.radii is not None:
+        extra["radius95_mm"] = short_texts(1000 * answer.radii)
+    extra["nominal_error_mm"] = short_texts(1000 * answer.nominal_distances)
+    if commands.moves is not None:
+        for kind, unit, scale in (("angle", "deg", 180 / np.pi), ("length", "mm", 1000.0)):
+            if own := [i for i, joint in enumerate(joints) if arm.commanded[joint] == kind]:
+                longest = np.abs(commands.moves[:, own]).max(axis=1)
+                extra[f"longest_move_{unit}"] = short_texts(scale * longest)
+    extra |= {"bound_mm": short_texts(1000 * commands.bounds), "reason": commands.reasons}
     requested = requested_channels({name: arm}, {}, measured=False)
-    extra = dict([*(_corrected(answer) if for_nominal else _counts(answer)), *_columns(answer)])
     # A target file may be a pose file: its commands, in whatever unit, give way to those that were found.
-    own = {f"{joint}_{unit}" for joint in compensator.joints for unit in UNITS}
-    kept = {column: texts for column, texts in given.extra.items() if column not in extra and column not in own}
+    replaced = {f"{joint}_{unit}" for joint in joints for unit in UNITS}
+    kept = {column: texts for column, texts in given.extra.items() if column not in extra and column not in replaced}
     dataset = replace(given, channels=channels, extra={**extra, **kept})
     write_csv(path, dataset, [c for c in requested if c.channel in channels], {"angle": angle_unit})
 
 
-def _counts(answer: Answer) -> Iterator[Column]:
-    compensator, commands = answer.compensator, answer.commands
-    for i, joint in enumerate(compensator.joints):
-        if commands.counts is not None and joint in compensator.expression.servos:
-            tick = compensator.expression.servos[joint][1].tick
-            yield f"{joint}_counts", tuple(str(count) for count in commands.counts[:, i])
-            yield f"{joint}_pulse_us", short_texts(1e6 * tick * commands.counts[:, i])
-
-
-def _corrected(answer: Answer) -> Iterator[Column]:
-    """Poses that a nominal controller is sent, and how far the targets are shifted and turned to these."""
-    targets, poses = answer.targets, sent(answer.bench.nominal, answer.commands)
-    yield from _pose("", poses)
-    for axis, shifts in zip("xyz", poses[:, :3, 3].T - targets.positions.T, strict=True):
-        yield f"d{axis}_mm", _exact(1000 * shifts)
-    if targets.rotations is not None:
-        for axis, turns in zip("xyz", turn_between(targets.rotations, poses[:, :3, :3]).T, strict=True):
-            yield f"turn_{axis}_rad", _exact(turns)
-
-
-def _columns(answer: Answer) -> Iterator[Column]:
-    compensator, commands = answer.compensator, answer.commands
-    yield "reached", tuple(_ENGLISH[bool(reached)] for reached in commands.reached)
-    yield from _pose("tool_", commands.base_T_tool)
-    yield "error_mm", short_texts(1000 * commands.distances)
-    yield "error_deg", short_texts(np.asarray(np.degrees(commands.turns)))
-    if answer.radii is not None:
-        yield "radius95_mm", short_texts(1000 * answer.radii)
-    yield "nominal_error_mm", short_texts(1000 * answer.nominal_distances)
-    if commands.moves is not None:
-        kinds = [compensator.expression.arm.commanded[joint] for joint in compensator.joints]
-        for kind, unit, scale in (("angle", "deg", 180 / np.pi), ("length", "mm", 1000.0)):
-            own = [i for i, text in enumerate(kinds) if text == kind]
-            if own:
-                yield f"longest_move_{unit}", short_texts(scale * np.abs(commands.moves[:, own]).max(axis=1))
-    yield "bound_mm", short_texts(1000 * commands.bounds)
-    yield "reason", commands.reasons
-
-
-def _pose(prefix: str, poses: Array) -> Iterator[Column]:
-    for i, axis in enumerate("xyz"):
-        yield f"{prefix}{axis}_mm", _exact(1000 * poses[:, i, 3])
+def _pose(prefix: str, poses: Array) -> dict[str, tuple[str, ...]]:
     turns = np.array([quaternion_of(pose[:3, :3]) for pose in poses]).reshape(-1, 4)
-    for i, axis in enumerate("wxyz"):
-        yield f"{prefix}q{axis}", _exact(turns[:, i])
+    columns = {f"{prefix}{axis}_mm": _exact(1000 * poses[:, i, 3]) for i, axis in enumerate("xyz")}
+    return columns | {f"{prefix}q{axis}": _exact(turns[:, i]) for i, axis in enumerate("wxyz")}
 
 
 def _exact(values: Array) -> tuple[str, ...]:

@@ -16,12 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from armcal.arm.assembly import Arm, command_channels, only_arm
-from armcal.arm.clearance import (
-    EVERYTHING,
-    Clearance,
-    ClearanceCheck,
-    joints_of_frames,
-)
+from armcal.arm.clearance import EVERYTHING, Clearance, ClearanceCheck, joints_of_frames
 from armcal.base.arrays import Array, Indices
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
@@ -179,27 +174,16 @@ _GRAVITY_TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class Experiment:
-    """A configuration made of real components.
+    """A configuration made of real components."""
 
-    Attributes:
-        name: of the experiment; the configuration file's if it gives none.
-        source: the configuration as written.
-        settings: as checked.
-        system: arms, measurements, statics.
-        parameters: with free ones, bounds and priors as configured.
-        estimator: built.
-        registry: the plugins.
-        warnings: what a user should know before data is read.
-    """
-
-    name: str
-    source: ConfigSource
-    settings: ExperimentSettings
-    system: System
-    parameters: Parameters
-    estimator: Estimator
-    registry: PluginRegistry
-    warnings: tuple[str, ...]
+    name: str  # of the experiment; the configuration file's if it gives none
+    source: ConfigSource  # the configuration as written
+    settings: ExperimentSettings  # as checked
+    system: System  # arms, measurements, statics
+    parameters: Parameters  # with free ones, bounds and priors as configured
+    estimator: Estimator  # built
+    registry: PluginRegistry  # the plugins
+    warnings: tuple[str, ...]  # what a user should know before data is read
 
     @classmethod
     def load(
@@ -209,13 +193,10 @@ class Experiment:
         data: str | Path | None = None,
         registry: PluginRegistry | None = None,
     ) -> Self:
-        """Read and check a configuration.
+        """Read and check a configuration (YAML).
 
-        Args:
-            path: the YAML file.
-            overrides: ``a.b=value`` texts, as after ``--set``.
-            data: a file to read instead of the configured one; may lie anywhere.
-            registry: plugins, if they were discovered before.
+        ``overrides`` are ``a.b=value`` texts, as after ``--set``; ``data`` is read instead of the configured file, and
+        may lie anywhere; ``registry`` are the plugins, if they were discovered before.
 
         Raises:
             ConfigError: the configuration is refused.
@@ -270,31 +251,19 @@ class Experiment:
             )
         require_conditions(dataset, request.channels)
         dataset = warn_beyond_limits(noticed(dataset), self.system.arms, self.parameters)
-        if text := self._heavy(dataset):
-            dataset = replace(dataset, warnings=(*dataset.warnings, text))
-        if not dataset.has("gravity_z"):
-            return dataset
-        typical = np.median(dataset.stacked(["gravity_x", "gravity_y", "gravity_z"]), axis=1)
-        texts = [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
-        return replace(dataset, warnings=(*dataset.warnings, *texts))
-
-    def _heavy(self, dataset: Dataset) -> str:
-        """A warning of a payload that no arm of this mass carries: grams called kilograms; else empty."""
-        configured = self.settings.statics.payload or 0.0
+        texts, configured = list[str](), self.settings.statics.payload or 0.0
         payload = float(np.max(dataset.column("payload"))) if dataset.has("payload") else configured
         own = sum(mass.mass for arm in self.system.arms.values() for mass in arm.masses)
-        if not own or payload <= _HEAVY * own:
-            return ""
-        times = f"{payload / own:.0f} times the mass of the links ({own:.3g} kg)"
-        return f"a payload of {payload:g} kg is {times}: is it in g?"
+        if own and payload > _HEAVY * own:
+            times = f"{payload / own:.0f} times the mass of the links ({own:.3g} kg)"
+            texts.append(f"a payload of {payload:g} kg is {times}: is it in g?")
+        if dataset.has("gravity_z"):
+            typical = np.median(dataset.stacked(["gravity_x", "gravity_y", "gravity_z"]), axis=1)
+            texts += [f"by its columns, {text}" for text in _gravity_warnings(self.settings, typical)]
+        return replace(dataset, warnings=(*dataset.warnings, *texts))
 
     def of_records(self, dataset: Dataset) -> Self:
-        """The experiment with the parameters that the groups of these records bring.
-
-        Raises:
-            ConfigError: what is configured of a group's parameters is refused.
-            DataError: a record's group is not stated.
-        """
+        """The experiment with the parameters that the groups of these records bring."""
         if not grouped_instances(self.system.measurements):
             return self
         groups = groups_of(dataset, self.system.measurements)
@@ -307,11 +276,7 @@ class Experiment:
         return pose_numbers(dataset, [*command_channels(self.system.arms)])
 
     def split(self, dataset: Dataset) -> Split:
-        """Which records train, and which are held out, as configured.
-
-        Raises:
-            ConfigError: no column separates the groups that are asked for, or no record is held out.
-        """
+        """Which records train, and which are held out, as configured."""
         validation = self.settings.validation
         if validation.group_by is not None:
             self.labels(dataset)
@@ -336,23 +301,11 @@ class Experiment:
     @property
     def label(self) -> str | None:
         """The text column that separates groups; None if there is none."""
-        text = self.settings.validation.group_by
-        if text is not None:
-            return text
-        labels = [
-            measurement.group_labels
-            for measurement in self.system.measurements.values()
-            if isinstance(measurement, GroupedMeasurement)
-        ]
-        return next((label[0] for label in labels if label), None)
+        grouped = [m for m in self.system.measurements.values() if isinstance(m, GroupedMeasurement)]
+        return self.settings.validation.group_by or next((m.group_labels[0] for m in grouped if m.group_labels), None)
 
     def labels(self, dataset: Dataset, label: str | None = None, where: Location | None = None) -> tuple[str, ...]:
-        """Which group each record belongs to, by the configured column, or by ``label`` (asked for ``where``).
-
-        Raises:
-            ConfigError: no column separates groups.
-            DataError: records are grouped by payload, and none states one.
-        """
+        """Which group each record belongs to, by the configured column, or by ``label`` (asked for ``where``)."""
         label = label or self.label
         if label == PAYLOAD and not (dataset.has(PAYLOAD) or label in dataset.extra):
             raise DataError(
@@ -390,11 +343,7 @@ class Experiment:
         }
 
     def simulator(self) -> Simulator:
-        """The configured simulator.
-
-        Raises:
-            ConfigError: none is configured.
-        """
+        """The configured simulator; a ConfigError if there is none."""
         if self.settings.simulation is None:
             raise ConfigError(
                 "found no simulation.",

@@ -95,11 +95,7 @@ def prepare(
     progress: Progress = no_progress,
     dataset: Dataset | None = None,
 ) -> Prepared:
-    """Everything that can be done and refused before solving; see ``assemble``.
-
-    Raises:
-        InputError: data, units, counts or rank do not allow a calibration.
-    """
+    """Everything that can be done and refused before solving; see ``assemble``."""
     ready = assemble(experiment, watch, accept, progress, dataset)
     with watch.stage("check"), noted(ready.notices):
         problems = require_solvable(ready.training, ready.problem.parameters.nominal())
@@ -116,30 +112,22 @@ def assemble(
     """Data read and checked, and the problem that it makes, whether or not it can be solved.
 
     With ``accept``, data that look mixed up are not refused, but a bad finding. Records that are at hand
-    (``dataset``) are not read.
-
-    Raises:
-        InputError: data, units or counts do not allow a calibration; its notes are the warnings of the data.
+    (``dataset``) are not read. The notes of an error are the warnings of the data.
     """
     with watch.stage("read"):
         dataset = experiment.read(progress) if dataset is None else dataset
     with noted(dataset.warnings):
         experiment = experiment.of_records(dataset)
         with watch.stage("build"):
-            problem, start = _aligned(experiment, dataset)
+            system, evaluator = experiment.system, experiment.settings.evaluator
+            parts = (system.arms, system.measurements, experiment.parameters, system.environment)
+            problem = Problem.build(*parts, dataset, evaluator)
+            start = with_proposals(aligned_start(problem, dataset), dataset)
+            problem = started(start.problem)
+            require_numbers(problem, dataset)
+            problem = acting(problem, dataset)
         with watch.stage("check"):
             return _checked(experiment, dataset, problem, start, accept)
-
-
-def _aligned(experiment: Experiment, dataset: Dataset) -> tuple[Problem, Start]:
-    """The compiled problem of these records, base and target where they have them, and where a fit starts."""
-    system, settings = experiment.system, experiment.settings
-    parts = (system.arms, system.measurements, experiment.parameters, system.environment)
-    problem = Problem.build(*parts, dataset, settings.evaluator)
-    start = with_proposals(aligned_start(problem, dataset), dataset)
-    problem = started(start.problem)
-    require_numbers(problem, dataset)
-    return acting(problem, dataset), start
 
 
 def acting(problem: Problem, dataset: Dataset) -> Problem:
@@ -148,13 +136,7 @@ def acting(problem: Problem, dataset: Dataset) -> Problem:
     return with_drift(with_joint_noise(problem, nominal), dataset, nominal)
 
 
-def _checked(
-    experiment: Experiment,
-    dataset: Dataset,
-    problem: Problem,
-    start: Start,
-    accept: bool,
-) -> Prepared:
+def _checked(experiment: Experiment, dataset: Dataset, problem: Problem, start: Start, accept: bool) -> Prepared:
     """Split, and checked by every check of data; what one calls bad is refused unless it is accepted."""
     system, settings, plan = experiment.system, experiment.settings, experiment.settings.plan
     unlearned(system)
@@ -291,7 +273,20 @@ def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> Ru
         context.progress("judging", 0.0)
         verdict = verdict_of(own, experiment.registry)
         context.progress("judging", 1.0)
-    suspicious = suspicious_records(own)
+    suspicious, prediction = suspicious_records(own), None
+    if own.converged:
+        ranges = recorded_ranges(own.dataset, experiment.system.arms, experiment.settings.statics.payload)
+        if outcome is not None and outcome.residual is not None and np.isfinite(outcome.reach):
+            ranges[UNKNOWN] = (0.0, outcome.reach)
+        columns = (experiment.source.data.get("data") or {}).get("columns") or {}
+        prediction = PredictionRecord(
+            entries=own.estimate.names,
+            covariance=covariance_rows(own.estimate.covariance),
+            stretches={name: one.stretch for name, one in own.of(intervals).items() if one.stretch},
+            columns={str(name): str(local) for name, local in columns.items()},
+            drifts={b.name: b.drift for b in own.fitted.problem.parameters.free if b.drift is not None},
+            ranges=ranges,
+        )
     text = f"{failed} of {len(own.ready.folds)} folds did not converge; their records are not cross-validated."
     return RunResult(
         name=experiment.name,
@@ -303,26 +298,9 @@ def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> Ru
         provenance=replace(experiment, system=own.system).provenance(own.dataset),
         noise=noise_content(own, suspicious),
         suspicious=suspicious,
-        prediction=_prediction(experiment, own, outcome),
+        prediction=prediction,
         groups=run_groups(experiment, own),
         pose_residual=outcome,
-    )
-
-
-def _prediction(experiment: Experiment, own: Fit, outcome: ResidualOutcome | None) -> PredictionRecord | None:
-    if not own.converged:
-        return None
-    ranges = recorded_ranges(own.dataset, experiment.system.arms, experiment.settings.statics.payload)
-    if outcome is not None and outcome.residual is not None and np.isfinite(outcome.reach):
-        ranges[UNKNOWN] = (0.0, outcome.reach)
-    columns = (experiment.source.data.get("data") or {}).get("columns") or {}
-    return PredictionRecord(
-        entries=own.estimate.names,
-        covariance=covariance_rows(own.estimate.covariance),
-        stretches={name: one.stretch for name, one in own.of(intervals).items() if one.stretch},
-        columns={str(name): str(local) for name, local in columns.items()},
-        drifts={b.name: b.drift for b in own.fitted.problem.parameters.free if b.drift is not None},
-        ranges=ranges,
     )
 
 

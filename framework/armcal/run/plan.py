@@ -1,22 +1,25 @@
 """A pose plan: which poses to measure, how good they are, how good any could be, and in which order to visit them.
 
-What planned poses need beside information: joints that come from either side, and angles between the usual ones.
-
-Come to from one side only, or from below at each upper end and from above at each lower one, a joint's play, gain and
-zero trade: each level therefore is a candidate from either side. A joint at an end of its range comes from inside.
-And the most informative poses of an arm of servos put each joint at few angles: its ends, and where its gains change.
-There a servo's table is right by construction; between them it is not, and no residual says so.
+Candidates are recorded poses, a grid, or all of joint space, where the arm may go. Besides information, planned poses
+need joints that come from either side, and angles between the usual ones. Come to from one side only, or from below at
+each upper end and from above at each lower one, a joint's play, gain and zero trade: each level therefore is a
+candidate from either side. A joint at an end of its range comes from inside. And the most informative poses of an arm
+of servos put each joint at few angles: its ends, and where its gains change. There a servo's table is right by
+construction; between them it is not, and no residual says so.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from armcal.arm.assembly import only_arm
-from armcal.arm.joints import by_dimension, joint_limits
+from armcal.arm.assembly import command_channels, only_arm, shown_joint, within_couplings
+from armcal.arm.joints import Limits, by_dimension, joint_limits
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
@@ -24,34 +27,232 @@ from armcal.base.units import display_unit, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.compensation import Compensator, Options
 from armcal.calibration.tool_expression import arm_expression
-from armcal.errors import ConfigError, ProblemError
+from armcal.config.system import build_component
+from armcal.errors import ConfigError, Location, ProblemError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import Identifiability, analyse, deviations, measures_of
 from armcal.estimate.simulation import approach_of, with_channels
+from armcal.measure.checks import TOLERANCE, own_limits, records_of, span_text
 from armcal.measure.groups import grouped_instances
-from armcal.planning.candidates import (
-    Candidates,
-    Observability,
-    efficiency,
-    observability,
-    value_of,
-    whitened_rows,
-)
+from armcal.measure.reader import Reader
+from armcal.planning.candidates import Candidates, Observability, efficiency, observability, value_of, whitened_rows
 from armcal.planning.exchange import Allowed, Plan, choose, refine
 from armcal.planning.relaxation import Task
+from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem, triangular
-from armcal.run.experiment import Experiment, PlanSettings
-from armcal.run.plan_poses import (
-    JointSpace,
-    Pool,
-    clearance_of,
-    counts_text,
-    dataset_of,
-    pool_of,
-    read_poses,
-    same_poses,
-    spread,
-)
+from armcal.run.experiment import Experiment, PlanSettings, clearance_check, with_data
+
+_OF_THE_MOMENT = ("time", "temperature")
+_MOST_GRID = 2_000_000
+_MOST_TRIED = 64
+_POWER = 12
+_SAME_POSE = 1e-9
+_BARRED = "too little clearance"
+
+
+@dataclass(frozen=True)
+class JointSpace:
+    """The joints of all arms, in order."""
+
+    channels: tuple[str, ...]  # of their commands (``arm.q1``)
+    names: tuple[str, ...]  # as a configuration calls them (``q1``; ``left.q1`` where there are several arms)
+    dimensions: tuple[str, ...]  # ``angle`` or ``length``
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> Self:
+        arms = experiment.system.arms
+        commands = command_channels(arms)
+        return cls(tuple(commands), tuple(shown_joint(c, arms) for c in commands), tuple(commands.values()))
+
+    def by_joint(
+        self, turning: Mapping[str, Sequence[float]], sliding: Mapping[str, Sequence[float]], keys: tuple[str, str]
+    ) -> dict[str, Array]:
+        """What is given of joints, by name."""
+        dimensions = dict(zip(self.names, self.dimensions, strict=True))
+        stated = by_dimension(dimensions, turning, sliding, (f"plan.{keys[0]}", f"plan.{keys[1]}"))
+        return {name: np.array(values) for name, values in stated.items()}
+
+    def limits(self, settings: PlanSettings) -> Array:
+        """Lowest and highest command of each joint (joints x 2); infinite where none is given."""
+        given = self.by_joint(settings.limits, settings.travel_limits, ("limits", "travel_limits"))
+        return np.array([given.get(name, np.array([-np.inf, np.inf])) for name in self.names])
+
+
+def stated_beyond(experiment: Experiment, stated: Mapping[str, Limits]) -> tuple[str, ...]:
+    """A sentence for each joint whose stated limits (rad or m) go beyond those of its model."""
+    texts, arms = [], experiment.system.arms
+    own = {
+        f"{name}.{joint}": ends
+        for name, arm in arms.items()
+        for joint, ends in own_limits(arm, experiment.parameters).items()
+        if joint not in arm.couplings  # theirs are of other angles than commands, and poses are left out by them
+    }
+    for channel, dimension in command_channels(arms).items():
+        given, known = stated.get(shown_joint(channel, arms)), own.get(channel)
+        if given and known and max(known[0] - given[0], given[1] - known[1]) > TOLERANCE[dimension]:
+            texts.append(
+                f"The stated limits of {shown_joint(channel, arms)}, {span_text(given, dimension)}, go beyond those of "
+                f"the arm's model, {span_text(known, dimension)}: it may run into its end stop, or into itself. Narrow "
+                "them, or correct the model if the arm does go farther."
+            )
+    return tuple(texts)
+
+
+@dataclass(frozen=True)
+class Pool:
+    kind: str  # where they come from
+    dataset: Dataset  # joint commands, approach, load and gravity
+    left_out: Mapping[str, int]  # how many were left out, by reason
+
+    def without(self, faulty: Mask, reason: str) -> Self:
+        if not faulty.any():
+            return self
+        left_out = {**self.left_out, reason: self.left_out.get(reason, 0) + int(faulty.sum())}
+        return replace(self, dataset=self.dataset.subset(np.flatnonzero(~faulty)), left_out=left_out)
+
+
+def clearance_of(experiment: Experiment) -> Allowed | None:
+    """The check of its plan's clearance, and of coupled joints' own limits; None where there is neither."""
+    plan, arms = experiment.settings.plan, experiment.system.arms
+    clearance = None if plan is None else plan.clearance
+    check = None if clearance is None else clearance_check(clearance, arms, experiment.source)
+    if not any(arm.couplings for arm in arms.values()):
+        return None if check is None else lambda poses: check(poses).allowed
+    within = partial(within_couplings, arms.values())
+    return within if check is None else lambda poses: check(poses).allowed & within(poses)
+
+
+def _pool_of(
+    experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: Allowed | None
+) -> Pool:
+    """Every candidate that lies within limits and keeps its clearance."""
+    limits = space.limits(settings)
+    usual = "continuous" if experiment.settings.data is None and np.isfinite(limits).all() else "recorded"
+    kind = "listed" if listed is not None else settings.candidates or usual
+    if kind == "continuous":
+        return spread(settings, space, limits, check)
+    if kind == "grid":
+        given = space.by_joint(settings.levels, settings.travel, ("levels", "travel"))
+        if missing := [name for name in space.names if name not in given]:
+            raise ConfigError(
+                f"found no levels for {', '.join(missing)}.",
+                hint="Give plan.levels (plan.travel for sliding joints): {q1: [-100 deg, 0 deg, 100 deg], ...}.",
+            )
+        total = math.prod(len(given[name]) for name in space.names)
+        if total > _MOST_GRID:
+            raise ConfigError(
+                f"the grid has {total} poses, expected at most {_MOST_GRID}.",
+                hint="Give fewer levels, or plan.candidates: continuous.",
+            )
+        axes = np.meshgrid(*[given[name] for name in space.names], indexing="ij")
+        poses = _dataset_of(np.array([axis.ravel() for axis in axes]), space)
+    else:
+        poses = commands_of(read_poses(experiment, listed), space)
+    pool, angles = Pool(kind, poses, {}), poses.stacked(space.channels)
+    outside = np.any((angles < limits[:, :1] - _SAME_POSE) | (angles > limits[:, 1:] + _SAME_POSE), axis=0)
+    pool = pool.without(outside, "beyond joint limits")
+    if check is not None:
+        pool = pool.without(~check(pool.dataset.stacked(space.channels)), _BARRED)
+    if not len(pool.dataset):
+        raise ProblemError(
+            f"none of the candidates is left ({counts_text(pool.left_out)}).",
+            hint="Check limits and clearance, or give other candidates.",
+        )
+    return pool
+
+
+def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
+    """Poses from a file, or from the configured data; measured values may be missing."""
+    source = experiment.source
+    if path is not None:
+        source = with_data(source, path)
+    elif experiment.settings.data is None:
+        raise ConfigError(
+            "found no poses to choose from.",
+            where=source.where(("data",)),
+            hint="Give --candidates FILE, --data FILE, or plan: {candidates: continuous, limits: ...}.",
+        )
+    reader: Reader
+    reader, _ = build_component(source, experiment.registry, "reader", ("data",))
+    return records_of(reader, experiment.request(measured=False))
+
+
+def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:
+    """What is commanded and what acts, without what was measured."""
+    kept = {
+        name: values
+        for name, values in dataset.channels.items()
+        if name in space.channels or ".approach." in name or ("." not in name and name not in _OF_THE_MOMENT)
+    }
+    return replace(dataset, channels=kept, extra={})
+
+
+def _same_poses(first: Array, second: Array) -> Mask:
+    """Which of the first (joints x N) are among the second (joints x M); (N, bool)."""
+    keys = {tuple(column) for column in np.round(second.T / _SAME_POSE).astype(np.int64).tolist()}
+    return np.array([tuple(c) in keys for c in np.round(first.T / _SAME_POSE).astype(np.int64).tolist()], dtype=bool)
+
+
+def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Allowed | None) -> Pool:
+    """Poses spread evenly between limits, by a scrambled Sobol sequence, after the corners of joint space."""
+    from scipy.stats import qmc
+
+    if not np.isfinite(limits).all():
+        missing = [n for n, row in zip(space.names, limits, strict=True) if not np.isfinite(row).all()]
+        raise ConfigError(
+            f"found no limits for {', '.join(missing)}.",
+            hint="Give plan.limits (plan.travel_limits for sliding joints): {q1: [-100 deg, 100 deg], ...}.",
+        )
+    sequence = qmc.Sobol(len(limits), rng=settings.seed)
+    kept_poses: list[Array] = []
+    kept = tried = 0
+    drawn = np.zeros((0, len(limits)))
+    for levels in ((0.0, 1.0), (0.0, 0.5, 1.0)):  # ends, or ends and middles, as far as those are not too many
+        if len(levels) ** len(limits) <= settings.count // 2:
+            drawn = np.array(list(product(levels, repeat=len(limits))))
+    while kept < settings.count and tried <= _MOST_TRIED * settings.count:
+        poses = (limits[:, 0] + drawn * (limits[:, 1] - limits[:, 0])).T
+        allowed = np.ones(poses.shape[1], dtype=bool) if check is None else check(poses)
+        kept_poses.append(poses[:, allowed])
+        kept, tried = kept + int(allowed.sum()), tried + poses.shape[1]
+        drawn = sequence.random(2**_POWER)
+    left_out = {_BARRED: tried - kept} if tried > kept else {}
+    if not kept:
+        raise ProblemError(f"none of {tried} poses keeps its clearance.", hint="Check plan.clearance.")
+    return Pool("continuous", _dataset_of(np.hstack(kept_poses)[:, : settings.count], space), left_out)
+
+
+def _dataset_of(poses: Array, space: JointSpace) -> Dataset:
+    """Poses (joints x N) with ids from 1."""
+    ids = tuple(str(i) for i in range(1, poses.shape[1] + 1))
+    return Dataset(ids, dict(zip(space.channels, np.ascontiguousarray(poses), strict=True)), source="plan")
+
+
+def counts_text(left_out: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in left_out.items()) or "none was given"
+
+
+def options_within(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Options:
+    """Compensation within limits and clearance of a configuration's ``plan``, for an arm with these joints."""
+    experiment = Experiment.load(path, registry=registry)
+    plan = experiment.settings.plan
+    if plan is None:
+        raise ConfigError(
+            "found no plan, expected its limits and clearance.",
+            where=Location(str(path)),
+            hint="Add plan: {limits: {q1: [-100 deg, 100 deg], ...}}.",
+        )
+    space = JointSpace.of(experiment)
+    if space.names != tuple(joints):
+        raise ConfigError(
+            f"its joints are {', '.join(space.names)}, those of the calibration {', '.join(joints)}.",
+            where=Location(str(path)),
+            hint="Give the configuration of the same arm.",
+        )
+    stated = zip(space.names, space.limits(plan), strict=True)
+    limits = {name: (float(low), float(high)) for name, (low, high) in stated if np.isfinite([low, high]).any()}
+    return Options(limits, allowed=clearance_of(experiment))
+
 
 _SPEEDS = {"angle": np.deg2rad(60.0), "length": 0.05}  # rad/s, m/s
 _MOST_PASSES = 50  # of an order of visit that is improved
@@ -90,21 +291,7 @@ class PlanContext:
         return Problem.build(system.arms, system.measurements, self.parameters, system.environment, records, evaluator)
 
 
-def parameters_of(experiment: Experiment, calibration: Path | None) -> Parameters:
-    """Those of the experiment, about the values of a calibration if one is given."""
-    parameters = experiment.parameters
-    if touching := grouped_instances(experiment.system.measurements):
-        raise ProblemError(
-            f"{touching[0]} is a contact: poses that touch cannot be chosen from free space.",
-            hint="Take postures up by hand, varied as docs/ball_and_sockets.md says; armcal identify names what they "
-            "determine, and what is missing.",
-        )
-    if not parameters.free:
-        raise ProblemError("no parameter is free: there is nothing to plan for.", hint="Set parameters.free.")
-    return values_about(experiment, calibration)
-
-
-def values_about(experiment: Experiment, calibration: Path | None) -> Parameters:
+def _values_about(experiment: Experiment, calibration: Path | None) -> Parameters:
     """An experiment's parameters, at the values of a calibration if one is given."""
     parameters = experiment.parameters
     if calibration is None:
@@ -124,27 +311,6 @@ def as_if_measured(experiment: Experiment, dataset: Dataset) -> Dataset:
     measured = [f"{name}.{c.name}" for name, m in experiment.system.measurements.items() for c in m.channels()]
     missing = [channel for channel in measured if channel not in dataset.channels]
     return with_channels(dataset, {channel: np.zeros(len(dataset)) for channel in missing})
-
-
-def in_order_of_visit(context: PlanContext, chosen: Dataset, *, keeps_approaches: bool) -> tuple[Dataset, float]:
-    """The poses in the order of visit, and the time that takes (s).
-
-    Approaches are what this order makes them, unless planned ones are kept.
-    """
-    settings, space = context.settings, context.space
-    given = space.by_joint(
-        {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
-        {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
-        ("speeds_deg_per_s", "speeds_mm_per_s"),
-    )
-    speeds = [given.get(n, np.array([_SPEEDS[d]])) for n, d in zip(space.names, space.dimensions, strict=True)]
-    times = travel_times(chosen.stacked(space.channels), np.concatenate(speeds))
-    order = quick_order(times) if settings.order == "travel" else np.arange(len(chosen))
-    visited = chosen.subset(order)
-    by_order = dict(zip(approach_channels(space), approach_of(visited.stacked(space.channels)), strict=True))
-    channels = by_order | dict(visited.channels) if keeps_approaches else dict(visited.channels) | by_order
-    numbers = tuple(str(i) for i in range(1, len(order) + 1))
-    return replace(visited, channels=channels, extra={"order": numbers}), path_time(times, order)
 
 
 def travel_times(joint_angles: Array, speeds: Array) -> Array:
@@ -231,13 +397,7 @@ def reachable(poses: Array, signs: Array, limits: Array) -> Array:
 
 
 def with_poses_between(poses: Array, limits: Array, chosen: Indices) -> Indices:
-    """A plan whose least informative poses are exchanged for ones between the angles that the others repeat.
-
-    Args:
-        poses: candidates (joints x N, rad or m).
-        limits: of each joint (joints x 2).
-        chosen: the plan, the most informative first.
-    """
+    """A plan, most informative first, whose last poses are exchanged for ones between angles that the others repeat."""
     count = math.ceil(SHARE * len(chosen))
     kept, scaled = chosen[: len(chosen) - count], (poses - limits[:, :1]) / np.ptp(limits, axis=1)[:, None]
     others = np.setdiff1d(np.arange(poses.shape[1]), chosen)
@@ -259,8 +419,6 @@ _MORE = "Plan more poses, give the records that are there already (--given), or 
 
 @dataclass(frozen=True)
 class PlanResult:
-    """A plan and what is known of it."""
-
     dataset: Dataset  # the poses in the order of visit, with planned approaches, else those that this order gives
     pool: Pool  # the candidates
     given: int  # how many records were there before
@@ -288,10 +446,18 @@ def make_plan(
     """Plan so many poses: of ``listed`` candidates or the configured ones, after ``records``, about a calibration."""
     settings = experiment.settings.plan or PlanSettings()
     space = JointSpace.of(experiment)
-    parameters = parameters_of(experiment, calibration)
+    if touching := grouped_instances(experiment.system.measurements):
+        raise ProblemError(
+            f"{touching[0]} is a contact: poses that touch cannot be chosen from free space.",
+            hint="Take postures up by hand, varied as docs/ball_and_sockets.md says; armcal identify names what they "
+            "determine, and what is missing.",
+        )
+    if not experiment.parameters.free:
+        raise ProblemError("no parameter is free: there is nothing to plan for.", hint="Set parameters.free.")
+    parameters = _values_about(experiment, calibration)
     check = clearance_of(experiment)
     progress("candidates", 0.0)
-    pool = pool_of(experiment, settings, space, listed, check)
+    pool = _pool_of(experiment, settings, space, listed, check)
     given = None if records is None else read_poses(experiment, records)
     context = PlanContext(experiment, settings, space, parameters, given)
     both = come_from_both_sides(pool, space, space.limits(settings), settings.seed)
@@ -299,7 +465,7 @@ def make_plan(
     if any(".approach." in channel for kernel in problem.kernels for channel in kernel.factor.channels):
         pool = both  # the model depends on the side from which a joint comes
     if given is not None and pool.kind != "continuous":
-        again = same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
+        again = _same_poses(pool.dataset.stacked(space.channels), given.stacked(space.channels))
         pool = pool.without(again, "measured already")
     if len(pool.dataset) < count:
         left_out = f" ({counts_text(pool.left_out)} left out)" if pool.left_out else ""
@@ -316,7 +482,12 @@ def make_plan(
         allowed = (lambda q: np.ones(q.shape[1], dtype=bool)) if check is None else check
         task, plan, pool, refined = _refined(context, task, plan, pool, allowed)
     progress("bound", 0.8)
-    return _result(context, task, _between(context, task, plan, pool), pool, refined)
+    if pool.kind == "continuous" and pool.dataset.has(approach_channels(space)[0]):
+        # Servos have play: some poses between the levels of the others.
+        poses = pool.dataset.stacked(space.channels)
+        chosen = with_poses_between(poses, space.limits(settings), plan.chosen)
+        plan = replace(plan, chosen=chosen, value=value_of(task.candidates, chosen))
+    return _result(context, task, plan, pool, refined)
 
 
 def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Identifiability:
@@ -365,15 +536,12 @@ def _refined(
     problem = context.problem(as_if_measured(context.experiment, pool.dataset))
 
     def dataset_at(poses: Array) -> Dataset:
-        plain = dataset_of(poses[:count], space)
-        return (
-            with_approaches(plain, space, reachable(poses[:count], poses[count:], limits[:count])) if sides else plain
-        )
+        plain, angles = _dataset_of(poses[:count], space), poses[:count]
+        return with_approaches(plain, space, reachable(angles, poses[count:], limits[:count])) if sides else plain
 
     def rows(poses: Array) -> Array:
-        return whitened_rows(
-            problem, context.parameters.nominal(), as_if_measured(context.experiment, dataset_at(poses))
-        )
+        records = as_if_measured(context.experiment, dataset_at(poses))
+        return whitened_rows(problem, context.parameters.nominal(), records)
 
     known = task.candidates.known()
     after = refine(before, limits, known, rows, lambda q: allowed(q[:count]), context.settings.sweeps)
@@ -391,27 +559,30 @@ def _refined(
     return task, plan, pool, int(np.sum(plan.chosen >= number))
 
 
-def _between(context: PlanContext, task: Task, plan: Plan, pool: Pool) -> Plan:
-    """The plan with some poses between the levels of the others, where servos have play and poses can be anywhere."""
-    space = context.space
-    if pool.kind != "continuous" or not pool.dataset.has(approach_channels(space)[0]):
-        return plan
-    poses = pool.dataset.stacked(space.channels)
-    chosen = with_poses_between(poses, space.limits(context.settings), plan.chosen)
-    return replace(plan, chosen=chosen, value=value_of(task.candidates, chosen))
-
-
 def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: int) -> PlanResult:
-    """A plan's figures."""
+    settings, space = context.settings, context.space
     parameters, chosen, bound = context.parameters, pool.dataset.subset(plan.chosen), plan.relaxation.bound
     measured = Task(Candidates(context.base, context.rows(chosen)), task.count)
     everything = np.arange(task.count)
     triangle = measured.candidates.triangle(everything)
     given = 0 if context.given is None else len(context.given)
     equations = (task.count + given) * measured.candidates.rows.shape[0] + len(context.priors)
-    dataset, seconds = in_order_of_visit(context, chosen, keeps_approaches=pool.kind in PLANNED)
+    speeds = space.by_joint(
+        {n: [np.deg2rad(v)] for n, v in settings.speeds_deg_per_s.items()},
+        {n: [v / 1000] for n, v in settings.speeds_mm_per_s.items()},
+        ("speeds_deg_per_s", "speeds_mm_per_s"),
+    )
+    known = zip(space.names, space.dimensions, strict=True)
+    by_joint = np.concatenate([speeds.get(name, np.array([_SPEEDS[dimension]])) for name, dimension in known])
+    times = travel_times(chosen.stacked(space.channels), by_joint)
+    order = quick_order(times) if settings.order == "travel" else np.arange(len(chosen))
+    visited = chosen.subset(order)
+    # Approaches are what this order makes them, unless planned ones are kept.
+    sides = dict(zip(approach_channels(space), approach_of(visited.stacked(space.channels)), strict=True))
+    channels = sides | dict(visited.channels) if pool.kind in PLANNED else dict(visited.channels) | sides
+    numbers = tuple(str(i) for i in range(1, len(order) + 1))
     return PlanResult(
-        dataset=dataset,
+        dataset=replace(visited, channels=channels, extra={"order": numbers}),
         pool=pool,
         given=given,
         equations=equations,
@@ -422,7 +593,7 @@ def _result(context: PlanContext, task: Task, plan: Plan, pool: Pool, refined: i
         names=parameters.coordinate_names,
         deviations=np.array([deviations(part) for part in (context.base, triangle)]) * parameters.scales(),
         identifiability=_identifiability(measured, everything, parameters),
-        travel_s=seconds,
+        travel_s=path_time(times, order),
         starts=plan.starts,
         refined=refined,
     )
@@ -544,26 +715,17 @@ def make_iso_plan(
 
     Gives the cube, the visits in order, and warnings.
     """
-    arm = only_arm(
-        experiment.system.arms, "the test is of a single arm", "Describe the arm that is to be tested alone."
-    )
-    space, settings, check = (
-        JointSpace.of(experiment),
-        experiment.settings.plan or PlanSettings(),
-        clearance_of(experiment),
-    )
+    alone = "Describe the arm that is to be tested alone."
+    arm = only_arm(experiment.system.arms, "the test is of a single arm", alone)
+    settings, check = experiment.settings.plan or PlanSettings(), clearance_of(experiment)
     # Of each joint, stated or the model's own; ``spread`` refuses a joint without.
     known = joint_limits(arm.nominal_chain, by_dimension(arm.commanded, settings.limits, settings.travel_limits))
     limits = np.array([known.get(joint) or (-np.inf, np.inf) for joint in arm.commanded], dtype=float)
-    parameters = values_about(experiment, calibration)
+    parameters, space = _values_about(experiment, calibration), JointSpace.of(experiment)
     plain = replace(arm, effects={}, masses=()) if calibration is None else arm
-    compensator = Compensator(
-        arm_expression(plain, parameters, experiment.system.environment),
-        parameters,
-        Options(
-            {name: (low, high) for name, (low, high) in zip(space.names, limits.tolist(), strict=True)}, allowed=check
-        ),
-    )
+    within = {name: (low, high) for name, (low, high) in zip(space.names, limits.tolist(), strict=True)}
+    expression = arm_expression(plain, parameters, experiment.system.environment)
+    compensator = Compensator(expression, parameters, Options(within, allowed=check))
     pool = spread(settings.model_copy(update={"count": _POSTURES}), space, limits, check)
     cube = _placed(compensator, pool.dataset.stacked(space.channels).T, size)
     dataset, warnings = _table(compensator, cube, cycles, directions, space)

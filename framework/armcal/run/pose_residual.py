@@ -49,13 +49,9 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of records by fits that did not see them, without and with a pose residual.
+    """Errors of records by fits that did not see them, without and with a pose residual."""
 
-    Attributes:
-        without, with_it: mean errors (mm, or mrad).
-    """
-
-    without: float
+    without: float  # mean error (mm, or mrad)
     with_it: float
     sure: float  # the difference in standard errors, of the measurement where it is least; above 0 where all are better
 
@@ -93,11 +89,8 @@ class ResidualOutcome:
         if self.residual is None:
             return system
         arms = {**system.arms, self.arm: replace(system.arms[self.arm], residual=self.residual)}
-        section = {"type": self.kind, **self.residual.settings.to_config()}
-        described = {
-            **system.description["arms"],
-            self.arm: {**system.description["arms"][self.arm], "residual": section},
-        }
+        section, described = {"type": self.kind, **self.residual.settings.to_config()}, system.description["arms"]
+        described = {**described, self.arm: {**described[self.arm], "residual": section}}
         return replace(system, arms=arms, description={**system.description, "arms": described})
 
     def findings(self) -> list[Finding]:
@@ -179,11 +172,7 @@ def layer_of(system: System, dataset: Dataset) -> Layer | None:
 
 
 def learned_residual(
-    experiment: Experiment,
-    layer: Layer,
-    plain: Fit,
-    progress: Progress,
-    executor: Executor | None,
+    experiment: Experiment, layer: Layer, plain: Fit, progress: Progress, executor: Executor | None
 ) -> ResidualOutcome:
     """Learn from the training records, and judge by folds of them, and by stretches of the recording."""
     training, fitted = plain.ready.training, plain.fitted
@@ -204,7 +193,11 @@ def learned_residual(
     along = cross_validate(training, stretches, *parts)
     at_random, gains = _compared(crossed, splits)
     in_stretches, _ = _compared(along, stretches, together=True)
-    unknown = _unknown(crossed, splits)
+    # How little the pose residuals of folds knew of each record that they did not see (m, standard deviation).
+    unknown = np.full(len(crossed.errors), np.nan)
+    for split, own in zip(splits, crossed.fits, strict=True):
+        if own.unknown is not None:
+            unknown[split.holdout] = sizes_of(own.unknown)
     harm = _harm(gains, unknown)
     kept = at_random.sure > _SURE and at_random.gain > _LEAST_GAIN and not harm
     return replace(
@@ -228,15 +221,6 @@ def _compared(crossed: CrossValidation, splits: tuple[Split, ...], together: boo
         without[split.holdout], gains[:, split.holdout] = own.without, own.gains
     chances = np.array([np.nanmean(gains[:, s.holdout], axis=1) for s, _ in known]).T if together else gains
     return Comparison.of(_MM * without, _MM * crossed.at_rest, chances), gains
-
-
-def _unknown(crossed: CrossValidation, splits: tuple[Split, ...]) -> Array:
-    """How little the pose residuals of folds knew of each record that they did not see (N; m, standard deviation)."""
-    unknown = np.full(len(crossed.errors), np.nan)
-    for split, own in zip(splits, crossed.fits, strict=True):
-        if own.unknown is not None:
-            unknown[split.holdout] = sizes_of(own.unknown)
-    return unknown
 
 
 def _harm(gains: Array, unknown: Array) -> str:

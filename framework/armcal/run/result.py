@@ -48,17 +48,14 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class SuspiciousRecord:
-    """A training record beyond its limit: where it stood, how many standard deviations off, what became of it.
+    """A training record beyond its limit."""
 
-    ``row`` is that of the source (0 if it has none); ``weight`` 0 means that it was set aside.
-    """
-
-    row: int
+    row: int  # of the source; 0 if it has none
     record_id: str
     measurement: str
-    deviations: float
+    deviations: float  # in standard deviations
     limit: float
-    weight: float
+    weight: float  # 0 if it was set aside
     error_mm: float
 
     @property
@@ -94,10 +91,7 @@ def noise_content(fit: Fit, suspicious: Sequence[SuspiciousRecord]) -> dict[str,
 
 
 def run_groups(experiment: Experiment, fit: Fit) -> dict[str, dict[str, Any]]:
-    """How wrong the model is on the records of each group (mean, mm), by name; none if nothing separates groups.
-
-    Distance errors are what is left of known distances within the group; None where none is known.
-    """
+    """How wrong the model is on the records of each group (mean, mm), by name; none if nothing separates groups."""
     problem, dataset, label, errors = fit.problem, fit.dataset, experiment.label, fit.errors
     if label is None or not (label in dataset.extra or (label == PAYLOAD and dataset.has(PAYLOAD))):
         return {}
@@ -129,16 +123,12 @@ def _within(name: str, distances: list[tuple[tuple[str, str], float]]) -> float 
 
 @dataclass(frozen=True)
 class ErrorTable:
-    """Error summaries (mm) by model and by records (train, holdout, cross_validated).
-
-    ``calibrated`` counts the drift that neighbouring records show; ``at_rest`` is without it, and empty if nothing
-    drifts. ``turns`` are those of orientations (deg): another table, without a drift; None where none are measured.
-    """
+    """Error summaries (mm) by model and by records (train, holdout, cross_validated)."""
 
     nominal: dict[str, ErrorSummary]
-    calibrated: dict[str, ErrorSummary]
-    at_rest: dict[str, ErrorSummary] = field(default_factory=dict)
-    turns: Self | None = None
+    calibrated: dict[str, ErrorSummary]  # counts the drift that neighbouring records show
+    at_rest: dict[str, ErrorSummary] = field(default_factory=dict)  # without that; empty if nothing drifts
+    turns: Self | None = None  # of orientations (deg), without a drift; None where none are measured
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -149,7 +139,6 @@ class ErrorTable:
 
     @classmethod
     def of(cls, errors: RecordErrors, split: Split) -> Self:
-        """The summaries of every record's errors."""
         judged = np.isfinite(errors.cross_validated_mm)
 
         def summaries(of: Array, crossed: Array) -> dict[str, ErrorSummary]:
@@ -170,37 +159,21 @@ class ErrorTable:
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run.
+    """A finished run."""
 
-    Attributes:
-        name: of the experiment.
-        command: how to repeat it.
-        fit: the problem, its records and the estimate, and whatever a check or a table asks of them.
-        verdict: what to conclude.
-        warnings: of config, data and problem.
-        seconds: of each stage, and ``total``.
-        provenance: hashes and versions.
-        noise: how the training records weighed, as metrics.json has it.
-        suspicious: training records beyond their limits.
-        bootstrap: refits to resampled records, if they were asked for.
-        prediction: what predictions need of the run beyond the values; None if it did not converge.
-        groups: errors of groups of records by name, where a column separates them, as metrics.json has them.
-        pose_residual: what became of one that was to be learned.
-    """
-
-    name: str
-    command: str
-    fit: Fit
-    verdict: Verdict
-    warnings: tuple[str, ...]
-    seconds: dict[str, float]
-    provenance: dict[str, Any]
-    noise: Mapping[str, Any] = field(default_factory=lambda: {"loss": "none", "scatter": {}})
-    suspicious: tuple[SuspiciousRecord, ...] = ()
-    bootstrap: Bootstrap | None = None
-    prediction: PredictionRecord | None = None
-    groups: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    pose_residual: ResidualOutcome | None = None
+    name: str  # of the experiment
+    command: str  # how to repeat it
+    fit: Fit  # the problem, its records and the estimate, and whatever a check or a table asks of them
+    verdict: Verdict  # what to conclude
+    warnings: tuple[str, ...]  # of config, data and problem
+    seconds: dict[str, float]  # of each stage, and ``total``
+    provenance: dict[str, Any]  # hashes and versions
+    noise: Mapping[str, Any] = field(default_factory=lambda: {"loss": "none", "scatter": {}})  # as metrics.json has it
+    suspicious: tuple[SuspiciousRecord, ...] = ()  # training records beyond their limits
+    bootstrap: Bootstrap | None = None  # refits to resampled records, if they were asked for
+    prediction: PredictionRecord | None = None  # what predictions need beyond the values; None if it did not converge
+    groups: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # errors by group, as metrics.json has them
+    pose_residual: ResidualOutcome | None = None  # what became of one that was to be learned
 
     @property
     def system(self) -> System:
@@ -254,13 +227,8 @@ FILES = ("experiment.yaml", "residuals.csv", "metrics.json", "report.html", "cal
 NOT_CONVERGED_SUFFIX = ".not-converged"
 DO_NOT_USE_SUFFIX = ".do-not-use"
 UNREADABLE_SUFFIX = ".unreadable"
-_OURS = (
-    "bootstrap.csv",  # of runs by earlier versions, which made these three files
-    "log.txt",
-    "profile.json",
-    *(f"calibration.yaml{suffix}" for suffix in (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX, UNREADABLE_SUFFIX)),
-    *FILES,
-)
+_SUFFIXES = (NOT_CONVERGED_SUFFIX, DO_NOT_USE_SUFFIX, UNREADABLE_SUFFIX)
+_OURS = (*(f"calibration.yaml{suffix}" for suffix in _SUFFIXES), *FILES)
 
 
 def reserved(folder: Path) -> AbstractContextManager[plain_files.Reservation]:
@@ -280,13 +248,10 @@ def write(
 ) -> None:
     """Write all files into a reserved folder; those of an earlier run in the same place move to ``earlier/``.
 
-    Raises:
-        InputError: the folder cannot be written.
-        ArmcalError: the calibration cannot be read back: it is left as ``calibration.yaml.unreadable``.
+    A calibration that cannot be read back is left as ``calibration.yaml.unreadable``, and raises an ArmcalError.
     """
-    texts: dict[str, str] = {}
     fault: ArmcalError | None = None
-    texts |= {
+    texts = {
         "experiment.yaml": dump(experiment.source.data),
         "residuals.csv": residuals_text(result),
         "metrics.json": as_json(metrics(result)) + "\n",
@@ -308,6 +273,12 @@ def write(
 def metrics(result: RunResult) -> dict[str, Any]:
     """The numbers of a run for other programs."""
     estimate, known, verdict = result.estimate, result.estimate.identifiability, result.verdict
+    resampled: dict[str, Any] | None = None
+    if (bootstrap := result.bootstrap) is not None:
+        rows = zip(bootstrap.names, bootstrap.deviations, bootstrap.intervals, strict=True)
+        numbers = {name: {"sd": float(sd), "lower": float(low), "upper": float(high)} for name, sd, (low, high) in rows}
+        resampled = {"refits": len(bootstrap.values), "failed": bootstrap.failed, "block_records": bootstrap.block}
+        resampled["parameters"] = {name: finite(own) for name, own in numbers.items()}
     content = {
         "experiment": result.name,
         "error_mm": _errors(result),
@@ -344,7 +315,7 @@ def metrics(result: RunResult) -> dict[str, Any]:
             for name, own in result.intervals.items()
             if own.half_width_mm is not None
         },
-        "bootstrap": _bootstrap_metrics(result),
+        "bootstrap": resampled,
         "warnings": list(result.warnings),
         "evaluator": result.backend,
         "seconds": dict(result.seconds),
@@ -442,18 +413,3 @@ def residuals_text(result: RunResult) -> str:
         residual = errors.calibrated_residual_mm[:, i]
         rows.append([record, row, "holdout" if held[i] else "train", weight, *numbers, *residual, *turned])
     return csv_text(rows)
-
-
-def _bootstrap_metrics(result: RunResult) -> dict[str, Any] | None:
-    bootstrap = result.bootstrap
-    if bootstrap is None:
-        return None
-    rows = zip(bootstrap.names, bootstrap.deviations, bootstrap.intervals, strict=True)
-    return {
-        "refits": len(bootstrap.values),
-        "failed": bootstrap.failed,
-        "block_records": bootstrap.block,
-        "parameters": {
-            name: finite({"sd": float(sd), "lower": float(low), "upper": float(high)}) for name, sd, (low, high) in rows
-        },
-    }

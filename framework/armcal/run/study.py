@@ -88,19 +88,11 @@ class Change:
 
 @dataclass(frozen=True)
 class VariantResult:
-    """One variant, judged.
-
-    Attributes:
-        crossed: errors of each record by a fit that did not see it (mm).
-        turns: errors of orientations (deg), where they are measured beside lengths: ``nominal``, ``train``,
-            ``cross_validated``.
-    """
-
     name: str  # of the variant
     free: int  # how many numbers the fit may change
     nominal: ErrorSummary  # errors without calibration (mm)
     train: ErrorSummary  # errors of a fit on all records, on the same records (mm)
-    crossed: ErrorSummary
+    crossed: ErrorSummary  # errors of each record by a fit that did not see it (mm)
     at_rest: ErrorSummary  # the same if nothing is known of a drift; equal where nothing drifts
     errors_mm: Array  # ``crossed`` record by record (N; nan where a fold did not converge)
     change: Change | None  # against the variant it is compared with (mm); None for the reference itself
@@ -108,7 +100,7 @@ class VariantResult:
     failed_folds: int  # how many fits of the cross-validation did not converge
     fit_seconds: float  # of the fit on all records
     seconds: float  # of all fits of this variant
-    turns: Mapping[str, ErrorSummary] | None = None
+    turns: Mapping[str, ErrorSummary] | None = None  # of orientations (deg), by records; where measured beside lengths
 
     def as_dict(self) -> dict[str, Any]:
         errors = {"nominal": self.nominal, "train": self.train}
@@ -127,14 +119,11 @@ class VariantResult:
 
 @dataclass(frozen=True)
 class NestedResult:
-    """The choice itself, judged: made inside of each fold's training records, its errors on the fold (mm).
-
-    ``chosen`` is the variant that each fold chose; ``errors_mm`` (N) is nan where the chosen fit did not converge.
-    """
+    """The choice itself, judged: made inside of each fold's training records, its errors on the fold (mm)."""
 
     crossed: ErrorSummary
-    chosen: tuple[str, ...]
-    errors_mm: Array
+    chosen: tuple[str, ...]  # by each fold
+    errors_mm: Array  # N; nan where the chosen fit did not converge
 
 
 @dataclass(frozen=True)
@@ -148,9 +137,6 @@ class Cell:
     cross_validated: bool  # the group also trained: its records were kept out of the training by folds
     failed_fits: int
     orientation_error_deg: ErrorSummary | None = None  # where orientations are measured
-
-    def as_dict(self) -> dict[str, Any]:
-        return {key: value for key, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +169,8 @@ class StudyResult:
         nested, grouped = self.nested, dict[str, Any]()
         if self.group_by is not None:
             grouped = {"group_by": self.group_by, "simulated": self.simulated, "groups": dict(self.groups)}
-            grouped["cells"] = [cell.as_dict() for cell in self.cells]
+            cells = [asdict(cell) for cell in self.cells]
+            grouped["cells"] = [{key: value for key, value in cell.items() if value is not None} for cell in cells]
         content = {
             "study": self.name,
             "records": len(self.dataset),
@@ -217,54 +204,53 @@ class Study:
         data: str | Path | None = None,
         registry: PluginRegistry | None = None,
     ) -> Self:
-        """Read and check a study; the arguments are those of ``Experiment.load``.
-
-        Raises:
-            ConfigError: the study or a variant is refused.
-            PluginError: a component is missing or broken.
-        """
+        """Read and check a study; the arguments are those of ``Experiment.load``."""
         registry = registry or discover()
         read = load_variants(path, overrides)
-        settings = _settings(read.base, tuple(read.variants))
+        source = read.base
+        if not isinstance(source.data.get("study"), dict):
+            raise ConfigError(
+                "found no study.",
+                where=source.where(("study",)),
+                hint="Give study: {variants: {NAME: {extends: FILE}, ...}}; see docs/study.md.",
+            )
+        settings = validate(StudySettings, source, ("study",))
+        if settings.reference not in (PREVIOUS, *read.variants):
+            raise ConfigError(
+                f"found the reference {settings.reference!r}, expected {PREVIOUS} or one of "
+                f"{', '.join(read.variants)}.",
+                where=source.where(("study", "reference")),
+            )
         experiments = {}
-        for name, source in read.variants.items():
-            experiment = _naming(name, partial(Experiment.of, source, data, registry))
+        for name, variant in read.variants.items():
+            experiment = _naming(name, partial(Experiment.of, variant, data, registry))
             # Without the split that a run would make, a study draws its own folds; nothing is compiled before
             # everything is known to be solvable.
             chosen = experiment.settings.model_copy(update={"validation": ValidationSettings()})
             experiments[name] = replace(experiment, settings=chosen)
-        return cls(str(read.base.data.get("name") or Path(path).stem), read.base, settings, experiments)
+        return cls(str(source.data.get("name") or Path(path).stem), source, settings, experiments)
 
     def prepare(self, progress: Progress = no_progress) -> dict[str, Prepared]:
-        """The problem of each variant with its records: those that were measured, or else simulated.
-
-        Raises:
-            InputError: a variant is refused, or variants do not use the same records.
-        """
+        """The problem of each variant with its records: those that were measured, or else simulated."""
         ready = {}
         for name, experiment in self.experiments.items():
             open_choice: ExperimentSettings = experiment.settings
             if open_choice.evaluator == "auto":
                 open_choice = open_choice.model_copy(update={"evaluator": "interpreted"})
             ready[name] = _naming(name, partial(_prepared, replace(experiment, settings=open_choice), progress))
-        _require_same_records(ready)
+        (first_name, first), *others = ready.items()
+        outputs = [c for k in first.problem.kernels for c in k.factor.output_channels]
+        for name, other in others:
+            same = other.dataset.ids == first.dataset.ids and other.dataset.sha256 == first.dataset.sha256
+            measured = [c for k in other.problem.kernels for c in k.factor.output_channels]
+            if not same or measured != outputs:
+                raise ProblemError(
+                    f"the variants {first_name} and {name} are not judged on the same records: "
+                    f"{len(first.dataset)} and {len(other.dataset)} are used, measured are {', '.join(outputs)} and "
+                    f"{', '.join(measured)}.",
+                    hint="Give every variant the same data and measurements.",
+                )
         return ready
-
-
-def _settings(source: ConfigSource, variants: Sequence[str]) -> StudySettings:
-    if not isinstance(source.data.get("study"), dict):
-        raise ConfigError(
-            "found no study.",
-            where=source.where(("study",)),
-            hint="Give study: {variants: {NAME: {extends: FILE}, ...}}; see docs/study.md.",
-        )
-    settings = validate(StudySettings, source, ("study",))
-    if settings.reference not in (PREVIOUS, *variants):
-        raise ConfigError(
-            f"found the reference {settings.reference!r}, expected {PREVIOUS} or one of {', '.join(variants)}.",
-            where=source.where(("study", "reference")),
-        )
-    return settings
 
 
 def _naming(name: str, work: Callable[[], R]) -> R:
@@ -278,21 +264,6 @@ def _prepared(experiment: Experiment, progress: Progress) -> Prepared:
     simulated = experiment.settings.data is None and experiment.settings.simulation is not None
     made = experiment.simulator().simulate(experiment.simulation_request) if simulated else None
     return prepare(experiment, Stopwatch(), progress=progress, dataset=made)
-
-
-def _require_same_records(ready: Mapping[str, Prepared]) -> None:
-    (first_name, first), *others = ready.items()
-    outputs = [c for k in first.problem.kernels for c in k.factor.output_channels]
-    for name, other in others:
-        same = other.dataset.ids == first.dataset.ids and other.dataset.sha256 == first.dataset.sha256
-        measured = [c for k in other.problem.kernels for c in k.factor.output_channels]
-        if not same or measured != outputs:
-            raise ProblemError(
-                f"the variants {first_name} and {name} are not judged on the same records: "
-                f"{len(first.dataset)} and {len(other.dataset)} are used, measured are {', '.join(outputs)} and "
-                f"{', '.join(measured)}.",
-                hint="Give every variant the same data and measurements.",
-            )
 
 
 @dataclass(frozen=True)
@@ -343,7 +314,9 @@ def compare(
         for name, own in ready.items():
             for rows in groups.values():
                 _naming(name, partial(_require_solvable, own, rows))
-    whole, *parts = _trainings(groups, settings, poses)
+    listed: dict[tuple[str, ...], Indices] = {tuple(groups): np.arange(len(poses), dtype=np.intp)}
+    listed |= {(name,): rows for name, rows in groups.items()}
+    whole, *parts = (_Training(at, rows, _folds(rows, settings, poses), len(poses)) for at, rows in listed.items())
     inner = [_folds(outer.train, settings, poses) for outer in whole.folds] if settings.nested else []
     splits = [split for training in (whole, *parts) for split in training.splits]
     plan = [(name, split) for name in ready for split in (*splits, *chain.from_iterable(inner))]
@@ -352,7 +325,7 @@ def compare(
     judged = [_judged(name, ready[name], by_name[name], whole) for name in ready]
     variants = _compared(judged, settings)
     best, simplest = _choices(variants, settings)
-    trained = {name: _by_training(by_name[name], (whole, *parts)) for name in ready} if parts else {}
+    trained = {name: _by_training(ready[name], by_name[name], (whole, *parts)) for name in ready} if parts else {}
     return StudyResult(
         name=study.name,
         command=command,
@@ -366,8 +339,13 @@ def compare(
         group_by=settings.group_by,
         labels=labels,
         groups={name: len(rows) for name, rows in groups.items()},
-        cells=tuple(cell for name, own in trained.items() for cell in _cells(name, ready[name], own, groups)),
-        trained_mm={(n, at): o.errors_mm for n, own in trained.items() for at, o in own.items()},
+        cells=tuple(
+            own.cell(name, at, group, rows)
+            for name, by_training in trained.items()
+            for at, own in by_training.items()
+            for group, rows in groups.items()
+        ),
+        trained_mm={(n, at): o.errors_mm for n, own in trained.items() for at, o in own.items() if at},
         warnings=_warnings(ready, variants),
         seconds=watch.seconds,
         provenance=first.provenance(dataset),
@@ -397,13 +375,6 @@ def _groups(labels: Sequence[str], dataset: Dataset, settings: StudySettings) ->
 def _require_solvable(ready: Prepared, rows: Indices) -> None:
     problem = restricted(ready.problem.subset(rows))
     require_solvable(problem, problem.parameters.nominal())
-
-
-def _trainings(groups: Mapping[str, Indices], settings: StudySettings, poses: Indices) -> list[_Training]:
-    """All records, and those of each group."""
-    listed: dict[tuple[str, ...], Indices] = {tuple(groups): np.arange(len(poses), dtype=np.intp)}
-    listed |= {(name,): rows for name, rows in groups.items()}
-    return [_Training(names, rows, _folds(rows, settings, poses), len(poses)) for names, rows in listed.items()]
 
 
 def _folds(train: Indices, settings: StudySettings, poses: Indices) -> tuple[Split, ...]:
@@ -515,10 +486,7 @@ def change(errors: Array, others: Array, against: str, block: BlockLength = "aut
 def simplest_good(means: Array, freedoms: Sequence[int], changes: Sequence[Change]) -> int:
     """The model with the fewest parameters whose mean error is within one standard error of the lowest. [Hastie2009]
 
-    Args:
-        means: mean error of each model (M).
-        freedoms: how many parameters each has (M).
-        changes: each model against the one with the lowest mean (M).
+    ``changes`` are of each model against the one with the lowest mean.
     """
     best = int(np.nanargmin(means))
     good = [i for i, c in enumerate(changes) if i == best or c.mean <= c.standard_error]
@@ -556,41 +524,28 @@ def _nested(
 @dataclass(frozen=True)
 class _Trained:
     errors_mm: Array  # by record
-    turns_deg: Array
+    turns_deg: Array | None
     failed_fits: int
 
+    def cell(self, variant: str, trained_at: tuple[str, ...], group: str, rows: Indices) -> Cell:
+        turns = None if self.turns_deg is None else summarise(self.turns_deg[rows])
+        errors, crossed = summarise(self.errors_mm[rows]), group in trained_at
+        return Cell(variant, trained_at, group, errors, crossed, self.failed_fits, turns)
 
-def _by_training(fits: Sequence[JudgedFit], trainings: Sequence[_Training]) -> dict[tuple[str, ...], _Trained]:
-    """What each training of a variant says of every record: group by group, then all together."""
-    trained, at = {}, 0
+
+def _by_training(
+    ready: Prepared, fits: Sequence[JudgedFit], trainings: Sequence[_Training]
+) -> dict[tuple[str, ...], _Trained]:
+    """What a variant says of every record without calibration, then by each training: group by group, then all."""
+    nominal, turned = _nominal(ready)
+    trained, at = list[tuple[tuple[str, ...], _Trained]](), 0
     for training in trainings:
         own = fits[at : at + len(training.splits)]
         errors, _, turns = training.errors(own)
-        trained[training.groups] = _Trained(errors, turns, sum(not fit.converged for fit in own))
+        failed = sum(not fit.converged for fit in own)
+        trained.append((training.groups, _Trained(errors, None if turned is None else turns, failed)))
         at += len(own)
-    return dict([*list(trained.items())[1:], next(iter(trained.items()))])
-
-
-def _cells(
-    name: str, ready: Prepared, trained: Mapping[tuple[str, ...], _Trained], groups: Mapping[str, Indices]
-) -> list[Cell]:
-    """Without calibration, then by what was trained at, group by group."""
-    nominal, turned = _nominal(ready)
-    before = np.full(len(nominal), np.nan) if turned is None else turned
-    rows = {(): _Trained(nominal, before, 0), **trained}
-    return [
-        Cell(
-            name,
-            at,
-            group,
-            summarise(own.errors_mm[members]),
-            group in at,
-            own.failed_fits,
-            None if turned is None else summarise(own.turns_deg[members]),
-        )
-        for at, own in rows.items()
-        for group, members in groups.items()
-    ]
+    return dict([((), _Trained(nominal, turned, 0)), *trained[1:], trained[0]])
 
 
 def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) -> tuple[str, ...]:
@@ -607,16 +562,7 @@ def _warnings(ready: Mapping[str, Prepared], variants: Sequence[VariantResult]) 
 
 
 def files(result: StudyResult, study: ConfigSource, variants: Mapping[str, ConfigSource], page: str) -> dict[str, str]:
-    return {
-        "experiment.yaml": dump(_self_contained(study, variants)),
-        "study.csv": _csv_text(result),
-        "study.json": as_json(result.as_dict()) + "\n",
-        "study.html": page,
-    }
-
-
-def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -> dict[str, Any]:
-    """The configuration with each variant as the sections in which it differs: no other file is needed."""
+    """The configuration with each variant as the sections in which it differs: no other file is needed; and results."""
     read = next((own.data["data"] for own in variants.values() if "data" in own.data), None)
     data = study.data if read is None else {**study.data, "data": read}
     base = {key: section for key, section in data.items() if key != VARIANTS[0]}
@@ -624,11 +570,7 @@ def _self_contained(study: ConfigSource, variants: Mapping[str, ConfigSource]) -
     for name, own in variants.items():
         differing = {key: section for key, section in own.data.items() if base.get(key) != section}
         listed[name] = {"set": differing | {key: None for key in base if key not in own.data}}
-    return {**data, VARIANTS[0]: {**data[VARIANTS[0]], "variants": listed}}
-
-
-def _csv_text(result: StudyResult) -> str:
-    """A row a record, an error a variant, by a fit that did not see the record."""
+    # A row a record, an error a variant, by a fit that did not see the record.
     columns: dict[str, Any] = {} if result.group_by is None else {result.group_by: result.labels}
     columns |= {f"{v.name}_{result.unit}": v.errors_mm for v in result.variants}
     if result.nested:
@@ -637,9 +579,13 @@ def _csv_text(result: StudyResult) -> str:
         if len(trained) < len(result.groups):
             columns[f"{name}_trained_at_{'_and_'.join(trained).replace(' ', '_')}_{result.unit}"] = errors
     dataset = result.dataset
-    rows = dataset.rows or ("",) * len(dataset)
-    body = zip(dataset.ids, rows, *columns.values(), strict=True)
-    return csv_text([["pose_id", "source_row", *columns], *body])
+    body = zip(dataset.ids, dataset.rows or ("",) * len(dataset), *columns.values(), strict=True)
+    return {
+        "experiment.yaml": dump({**data, VARIANTS[0]: {**data[VARIANTS[0]], "variants": listed}}),
+        "study.csv": csv_text([["pose_id", "source_row", *columns], *body]),
+        "study.json": as_json(result.as_dict()) + "\n",
+        "study.html": page,
+    }
 
 
 _FOLDS = 5

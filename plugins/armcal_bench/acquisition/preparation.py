@@ -16,8 +16,7 @@ from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice, standing_at
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment, clearance_check
-from armcal.run.plan import approach_channels
-from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
+from armcal.run.plan import JointSpace, approach_channels, commands_of, read_poses, stated_beyond
 
 from armcal_bench.acquisition.drive import JointPath, PathPlanner, travel
 from armcal_bench.acquisition.heat import COOLED_TO, NEVER, HeatModel, holding_torques

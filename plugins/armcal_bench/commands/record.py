@@ -11,8 +11,7 @@ from typing import Any, Literal
 
 import click
 from armcal.base.config_text import ConfigText
-from armcal.cli.common import Console
-from armcal.cli.console import say
+from armcal.cli.common import Console, say
 from armcal.config.yaml_source import ConfigSource
 from armcal.devices.line_source import KINDS, STANDARD_INPUT
 from armcal.errors import InputError, Location

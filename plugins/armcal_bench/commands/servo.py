@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from armcal.cli.common import Console
-from armcal.cli.console import say
+from armcal.cli.common import Console, say
 from armcal.devices.device import DeviceError
 from armcal.devices.wiring import WiringRecord, servo_file_of
 from armcal.errors import EXIT_FAULT, EXIT_INCOMPLETE, EXIT_STOPPED, InputError

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 
 import click
 from armcal.base.config_text import as_line
-from armcal.cli.console import say
+from armcal.cli.common import say
 from armcal.errors import ArmcalError, InputError, Location
 
 from armcal_online.running.situation import EARLIER, EVENTS, present
