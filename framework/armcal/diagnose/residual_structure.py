@@ -38,7 +38,7 @@ from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import SMALLEST, Fit, FitRows, basis_of, lag_one, own_basis
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure, candidates
-from armcal.estimate.uncertainty import automatic_block_length
+from armcal.estimate.validation import automatic_block_length
 from armcal.measure.groups import PairedMeasurement, pose_numbers
 from armcal.problem.problem import Problem
 

@@ -30,9 +30,9 @@ from armcal.diagnose.residual_structure import CLEAR, structure
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import OF_PRIOR, determined_in_words
 from armcal.planning.candidates import whitened_rows
-from armcal.problem.motion import LOADS, Motion
 from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
+from armcal.problem.variants import LOADS, Motion
 
 LEVEL = 0.05
 COMPARABLE = 2.0  # Variances, each less than so many times the other

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.arrays import Array, Indices, Mask
-from armcal.planning.candidates import Candidates, log_determinant, value_of
-from armcal.planning.relaxation import AT_ONCE, Relaxation, Task, relax
+from armcal.planning.candidates import AT_ONCE, Candidates, Relaxation, Task, log_determinant, relax, value_of
 
 Rows = Callable[[Array], Array]  # Poses (joints x N) to whitened Jacobians (n_r x N x n)
 Allowed = Callable[[Array], Mask]  # Poses (joints x N) to whether each may be visited (N, bool)

@@ -32,13 +32,13 @@ from armcal.measure.groups import grouped_instances
 from armcal.planning.candidates import (
     Candidates,
     Observability,
+    Task,
     efficiency,
     observability,
     value_of,
     whitened_rows,
 )
 from armcal.planning.exchange import Allowed, Plan, choose, refine
-from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment, PlanSettings
 from armcal.run.plan_poses import (

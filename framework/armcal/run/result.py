@@ -33,11 +33,10 @@ from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
 from armcal.estimate.prediction import residual_spread
-from armcal.estimate.uncertainty import Bootstrap
-from armcal.estimate.validation import ErrorSummary, Recording, Split, in_unit, summarise
+from armcal.estimate.validation import Bootstrap, ErrorSummary, Recording, Split, in_unit, summarise
 from armcal.io import folder as folders
-from armcal.measure.csv_writer import csv_text
 from armcal.measure.reader import surroundings
+from armcal.measure.tables import csv_text
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, group_texts

@@ -19,7 +19,7 @@ from armcal.errors import InputError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import MinimalSet, minimal_set
 from armcal.estimate.simulation import measured_without_noise
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.problem.variants import factor_at_zero
 from armcal.report.page import page

@@ -28,7 +28,7 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.folder import reserved
 from armcal.io.lines import StandardOutput
 from armcal.io.plain_files import writing
-from armcal.measure.csv_writer import csv_text, write_csv
+from armcal.measure.tables import csv_text, write_csv
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
