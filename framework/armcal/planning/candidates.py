@@ -97,7 +97,6 @@ def log_determinant(eigenvalues: Array) -> Array:
 
 
 def value_of(candidates: Candidates, chosen: Indices) -> float:
-    """The log determinant of what is known and the chosen ones."""
     singular = np.linalg.svd(candidates.triangle(chosen), compute_uv=False)
     padded = np.pad(singular, (0, candidates.size - len(singular)))
     return float(log_determinant(np.sort(padded**2)))
@@ -110,9 +109,9 @@ def efficiency(value: float, bound: float, size: int) -> float:
 
 @dataclass(frozen=True)
 class Observability:
-    """The five indices [Sun2008]; larger is better, 0 where a combination is undetermined.
+    """The five indices [Sun2008] by s_1 >= ... >= s_n > 0, the singular values of the scaled whitened Jacobian.
 
-    With s_1 >= ... >= s_n > 0 the singular values of the scaled whitened Jacobian of m equations:
+    Larger is better, 0 where a combination is undetermined.
     """
 
     o1: float  # geometric mean over sqrt(m), (s_1 ... s_n)^(1/n) / sqrt(m). [Borm1989] [Borm1991]
@@ -123,11 +122,7 @@ class Observability:
 
 
 def observability(singular_values: Array, equations: int) -> Observability:
-    """The indices of a pose set.
-
-    Args:
-        singular_values: of its Jacobian (n), in any order; one a parameter, zeros included.
-        equations: how many rows the Jacobian has, m.
+    """The indices of a pose set from the singular values (n, in any order, zeros included) of its m equations.
 
     Raises:
         ValueError: no singular value, no equation, or a value that is negative or not finite.
@@ -155,8 +150,8 @@ def whitened_rows(problem: Problem, values: Array, dataset: Dataset) -> Array:
     """Whitened Jacobians by coordinates in typical scales, all factors stacked (n_r x N x n).
 
     Of poses that are only thought of nothing was measured: what the model predicts stands in for it, and what would be
-    out of view is left out. Where a record
-    has more rows than there are coordinates, n triangular ones with the same information stand in for them.
+    out of view is left out. Where a record has more rows than there are coordinates, n triangular ones with the same
+    information stand in for them.
     """
     chain = problem.parameters.entries_jacobian(values) * problem.parameters.scales()
     shown = as_predicted(problem.of(as_seen(problem, values, dataset)[0]), values)
@@ -179,8 +174,6 @@ _CENTRING = 0.15
 
 @dataclass(frozen=True)
 class Task:
-    """How many poses to choose from which candidates."""
-
     candidates: Candidates
     count: int
 
@@ -198,15 +191,12 @@ class Tangent:
 
 @dataclass(frozen=True)
 class Relaxation:
-    """What the relaxation says."""
-
     weights: Array  # of the candidates (N)
     bound: float  # no plan has a larger value
     scores: Array  # what each candidate adds to the bound at most (N)
 
 
 def tangent(task: Task, weights: Array) -> Tangent:
-    """The tangent at weights (N)."""
     candidates = task.candidates
     known = candidates.known()
     information = candidates.information(weights) + candidates.ridge() * np.eye(candidates.size)
@@ -267,8 +257,8 @@ def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> In
 def interior_point(task: Task) -> tuple[Array, Tangent]:
     """A primal-dual interior-point method in the weights [Nocedal2006].
 
-    Its Newton matrix is the Hessian of the log determinant, K K', plus a diagonal; it is solved in whichever of the two
-    sizes is smaller.
+    Its Newton matrix, the Hessian K K' of the log determinant plus a diagonal, is solved in the smaller of the two
+    sizes.
     """
     number = task.candidates.count
     weights = np.full(number, task.count / number)

@@ -39,8 +39,6 @@ _FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved throug
 
 @dataclass(frozen=True)
 class Plan:
-    """A chosen set of poses."""
-
     chosen: Indices  # in the order in which each adds most to those before it
     value: float  # the log determinant, with what is known before
     starts: int  # how many were made
@@ -48,7 +46,7 @@ class Plan:
 
 
 def choose(task: Task, starts: int = STARTS, seed: int = 0, begin: Indices | None = None) -> Plan:
-    """The best plan of several starts.
+    """The best plan of several starts; ValueError with fewer candidates than poses.
 
     Args:
         task: candidates and number of poses.
@@ -56,9 +54,6 @@ def choose(task: Task, starts: int = STARTS, seed: int = 0, begin: Indices | Non
             kicks of the best plan.
         seed: of what is random.
         begin: a plan to start from as well.
-
-    Raises:
-        ValueError: fewer candidates than poses.
     """
     if task.count > task.candidates.count:
         raise ValueError(f"{task.count} poses of {task.candidates.count} candidates")
@@ -327,11 +322,8 @@ def refine(poses: Array, limits: Array, known: Array, rows: Rows, allowed: Allow
         limits: of each joint (joints x 2).
         known: information before the plan, by coordinates in typical scales (n x n).
         rows: Jacobians of poses.
-        allowed: clearance.
+        allowed: clearance of poses that are moved.
         sweeps: how often each pose is tried.
-
-    Returns:
-        the poses (joints x N), within limits and allowed where they were moved.
     """
     poses = np.array(poses)
     held = rows(poses)

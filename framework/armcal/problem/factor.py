@@ -47,15 +47,10 @@ _POINT = "point."
 class Factor(ElasticPass):
     """The expressions of one measurement.
 
-    Attributes:
-        values: free canonical entries (symbols, n_v); fixed ones are numbers in the expressions.
-        record: symbols, one a channel.
-        state: deflections of all arms that take part (symbols, n_d).
-        noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
-        nuisance_starts: entries of the group's parameters by the record alone, to start from; empty for none.
-        points: what distinguishes the points of a measurement that reads the same of many (P x k); None of any other.
-            Channels, noise and dimensions are then those of all points, and ``of_point`` has the expressions.
-        of_point: the factor of one point: its channels are the shared ones, its own, and the k numbers of the point.
+    ``values`` are the free canonical entries (symbols, n_v; fixed ones are numbers in the expressions), ``record`` a
+    symbol a channel, ``state`` the deflections of all arms that take part (symbols, n_d). Of a measurement that reads
+    the same of many points, channels, noise and dimensions are those of all points, and ``of_point`` has the
+    expressions: its channels are the shared ones, its own, and the k numbers of the point.
     """
 
     name: str  # the measurement's instance name
@@ -65,13 +60,13 @@ class Factor(ElasticPass):
     outputs: Expression  # what the instrument would read (n_o), named by ``output_channels``
     tools: Expression  # each arm's base_T_tool without its last row, column by column (12 an arm; m)
     noise: tuple[float, ...]  # standard deviation of each residual entry
-    noise_channels: tuple[tuple[str, ...], ...] = ()
+    noise_channels: tuple[tuple[str, ...], ...] = ()  # of each entry, those that may carry its own one, nearest first
     dimensions: tuple[str, ...] = ()  # ``length`` or ``angle`` of each residual entry
-    nuisance_starts: Expression = None
+    nuisance_starts: Expression = None  # entries of the group's parameters by the record alone; empty for none
     nuisance_names: tuple[str, ...] = ()  # local names of the parameters of these entries, one an entry
     mean_weight: float = 1.0  # how many times more the mean of a group's residuals weighs
     joints: tuple[tuple[str, str], ...] = ()  # channels of commanded joints, each with ``angle`` or ``length``
-    points: Array | None = None
+    points: Array | None = None  # what distinguishes them (P x k)
     of_point: Factor | None = None
     margin: Expression = None  # of one point, above zero where it is in view; None where the view is not limited
 
@@ -85,7 +80,6 @@ class Factor(ElasticPass):
 
     @property
     def expressed(self) -> Factor:
-        """The factor that has the expressions: of one point, where there are many; else this one."""
         return self.of_point or self
 
     @property
@@ -133,8 +127,8 @@ class Factor(ElasticPass):
     def hessian_function(self) -> ca.Function:
         """(values, record, state, W) -> exact Hessian (n_v x n_v) of half of |W residual|^2, in equilibrium.
 
-        W (n_r x n_r) is the whitening.
-        The second derivative of the Lagrangian along the equilibrium's tangent. [Griewank2008]
+        W (n_r x n_r) is the whitening. The Lagrangian's second derivative along the equilibrium's tangent.
+        [Griewank2008]
         """
         whitening = ca.SX.sym("whitening", self.residual.numel(), self.residual.numel())
         inputs = [*self._inputs, whitening]
@@ -242,7 +236,6 @@ def _free_and_fixed(parameters: Parameters) -> tuple[Expression, dict[str, Expre
 def _nuisance_starts(
     groups: GroupedMeasurement | None, states: Mapping[str, ArmState], local: Mapping[str, Expression]
 ) -> tuple[tuple[str, ...], Expression]:
-    """Where a record alone has its group's parameters start: local names, one an entry, and entries."""
     starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
     names = tuple(n for n, entries in starts.items() for _ in range(entries.numel()))
     return names, ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
@@ -271,7 +264,6 @@ def _reading(
     local: Mapping[str, Expression],
     unrolled: bool,
 ) -> _Reading:
-    """Of the whole record, or of one point, whose numbers are channels, where there are points."""
     if unrolled or not isinstance(measurement, PointMeasurement):
         shown = _checked_outputs(measurement, measurement.outputs(states, local))
         measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
@@ -287,7 +279,6 @@ def _reading(
 
 
 def _of_points(factor: Factor, measurement: Measurement, points: Array) -> Factor:
-    """The factor of records with all points, from that of one point, which it keeps."""
     name, rows, own = factor.name, factor.residual.numel(), factor.output_channels
     numbers = {f"{name}.{_POINT}{i}": i for i in range(points.shape[1])}
     shared = tuple(channel for channel in factor.channels if channel not in own and channel not in numbers)
@@ -351,7 +342,6 @@ def _arm_states(
 
 
 def _checked_outputs(measurement: Measurement, outputs: Any) -> dict[str, Expression]:
-    """The outputs of a measurement, each an expression (1 x 1), by local names of its channels."""
     channels = [channel.name for channel in measurement.channels()]
     expected = f"the expression of each channel by name: {', '.join(channels)}"
     with expecting(measurement.outputs, outputs, expected):

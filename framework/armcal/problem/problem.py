@@ -58,10 +58,7 @@ __all__ = ["Compiled", "FactorRecords", "NormalEquations", "Problem", "triangula
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Half the squared whitened residuals and their Gauss-Newton model.
-
-    ``gradient`` (n) and ``hessian`` (n x n) are with respect to the free canonical entries.
-    """
+    """Half the squared whitened residuals, gradient (n) and Gauss-Newton Hessian by the free canonical entries."""
 
     cost: float
     gradient: Array
@@ -96,21 +93,16 @@ def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
 
 @dataclass(frozen=True)
 class TieFunction:
-    """One tie, ready to evaluate.
-
-    Attributes:
-        bend: of those numbers and a factor for each entry of the residual to the second derivative of their product.
-    """
+    """One tie, ready to evaluate."""
 
     groups: tuple[str, str]  # the keys
     entries: Indices  # positions in a value vector of what it holds together (n)
     noise: Array  # standard deviation of each entry of its residual
     function: ca.Function  # of those numbers to the residual (m or rad) and its Jacobian
-    bend: ca.Function
+    bend: ca.Function  # of these and a factor for each entry of the residual: second derivative of their product
 
     @classmethod
     def of(cls, owned: OwnedTie, parameters: Parameters) -> TieFunction:
-        """Built for the blocks of a problem."""
         entries: list[int] = []
         sides: tuple[dict[str, Expression], dict[str, Expression]] = ({}, {})
         for side, names in zip(sides, owned.names, strict=True):
@@ -244,7 +236,6 @@ class Compiled:
 
     @cached_property
     def grouped(self) -> tuple[GroupedKernel, ...]:
-        """Each kernel with where its values come from, and where its Jacobian goes."""
         return self.blueprint.grouped(self.kernels, self.parameters)
 
     @cached_property
@@ -337,7 +328,6 @@ class Problem:
         return replace(self, records=tuple(records))
 
     def with_record(self, number: int, records: FactorRecords) -> Self:
-        """With other records of one measurement."""
         return replace(self, records=(*self.records[:number], records, *self.records[number + 1 :]))
 
     def with_parameters(self, parameters: Parameters, tied: bool = True) -> Self:
@@ -408,7 +398,6 @@ class Problem:
 
     @property
     def pairs(self) -> Iterator[tuple[GroupedKernel, FactorRecords]]:
-        """Each measurement's kernel with its records."""
         return zip(self.grouped, self.records, strict=True)
 
     def equations(self) -> int:
@@ -428,11 +417,7 @@ class Problem:
         return here.taken_off(raw, there.states([r[:, :, None] for r in training.weighted_residuals(values)]))
 
     def require_held(self, values: Array) -> None:
-        """Refuse values at which springs do not hold the arm in every record.
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
-        """
+        """Refuse values at which a record has no elastic equilibrium, or none that is stable (NotConvergedError)."""
         self.residuals(values)
         for grouped, record in self.pairs:
             grouped.require_held(values, record)
@@ -451,7 +436,6 @@ class Problem:
         return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
 
     def weighted_residuals(self, values: Array) -> tuple[Array, ...]:
-        """Residuals in units of their noise, times the roots of their weights, one (n_r x N) matrix a factor."""
         return self._weighted(self.whitened_residuals(values))
 
     def _weighted(self, whitened: Sequence[Array]) -> tuple[Array, ...]:
@@ -630,7 +614,6 @@ class PosedProblem:
         return NormalEquations(moved.cost, moved.gradient, moved.hessian + curvature)
 
     def exact_hessian(self, x: Array) -> Array:
-        """The Hessian by ``x`` with the curvature of the residuals."""
         data = self.problem.normal_equations(self.values(x))
         exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x)))
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
@@ -645,7 +628,6 @@ class PosedProblem:
         return by_data.gradient + weighted @ self.coordinates(x), by_data.hessian + weighted @ by_prior
 
     def _coordinates_jacobian(self, x: Array) -> Array:
-        """d ``c`` / d ``x``."""
         jacobian = self.problem.parameters.coordinates_jacobian(x * self.scales)
         return jacobian * self.scales / self.coordinate_scales[:, None]
 
@@ -661,10 +643,8 @@ class PosedProblem:
 def require_numbers(problem: Problem, dataset: Dataset) -> None:
     """Refuse a problem whose residuals or derivatives are no numbers (NaN, infinite) at the nominal values.
 
-    Raises:
-        DataError: a record has no number where the measurement needs one.
-        PluginError: the displacement of an effect is none; with its method.
-        ProblemError: another residual or a derivative is none; with measurement and record, or parameters.
+    The error names the record that has no number where the measurement needs one, the method of the effect whose
+    displacement is none (PluginError), or measurement and record, or parameters.
     """
     nominal = problem.parameters.nominal()
     for kernel, own, residual in zip(problem.kernels, problem.records, problem.residuals(nominal), strict=True):

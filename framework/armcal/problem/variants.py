@@ -4,16 +4,14 @@ Projected onto the model: what would have been measured had the values at hand b
 Where a Jacobian depends on measured numbers (a bearing, a contact, a closed chain) their errors turn undetermined
 directions into seemingly determined ones.
 
-With other readings: a residual need not be the readings less their predictions, one by one: it may have another order,
-sign or unit, or as few numbers as the rotation vector of a quaternion. What a residual means for the readings follows
-from its slope by them: the smallest change of the readings, each in the size that noise gives it, that changes the
-residual so.
+With other readings: a residual may have another order, sign or unit than its readings less their predictions, or as few
+numbers as the rotation vector of a quaternion. What it means for the readings follows from its slope by them: the
+smallest change of the readings, each in the size that noise gives it, that changes the residual so.
 
-Correlated by parameters that drift over a recording, which move slowly between records and are none of the arm. A
-drifting parameter is its value plus a stationary process whose correlation falls by e over a stated distance in
-recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), exactly so at the records' own places. It is no further
-parameter but a covariance of the residuals: the values found stay those of the arm at rest, their uncertainty counts
-the drift, and where records lie near others they determine the drift.
+Correlated by parameters that drift over a recording. A drifting parameter is its value plus a stationary process whose
+correlation falls by e over a stated distance in recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), exactly so
+at the records' own places. It is a covariance of the residuals: the values found stay those of the arm at rest, their
+uncertainty counts the drift, and where records lie near others they determine the drift.
 
 How an arm stands in each record (``Motion``): how its joints would move the residuals, and what its sites carry.
 """
@@ -273,13 +271,10 @@ def corrected(problem: Problem, arm: Arm, corrections: Array) -> Problem:
 
 @dataclass(frozen=True)
 class Moved:
-    """How far corrections move the tool of an arm in each record (N; m): all of them, and parts of them alone.
-
-    Parts are ``tool`` and those joints that are corrected, by name.
-    """
+    """How far corrections move the tool of an arm in each record (N; m): all of them, and parts of them alone."""
 
     altogether: Array
-    parts: Mapping[str, Array]
+    parts: Mapping[str, Array]  # ``tool``, and those joints that are corrected, by name
 
 
 def moved_by(problem: Problem, values: Array, arm: Arm) -> Moved:
@@ -311,9 +306,7 @@ def sizes_of(covariances: Sequence[Array]) -> Array:
 
 
 def unexplained(
-    problem: Problem,
-    values: Array,
-    learned: Mapping[str, tuple[PoseResidual, Postures]] | None = None,
+    problem: Problem, values: Array, learned: Mapping[str, tuple[PoseResidual, Postures]] | None = None
 ) -> list[Array]:
     """Covariance of residuals by what learned pose residuals do not know (N x n_r x n_r a factor; SI).
 
@@ -401,15 +394,10 @@ def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset,
 
 @dataclass(frozen=True)
 class Chain:
-    """The places of records in a recording, in order, each once.
+    """The places of records in a recording, in order, each once."""
 
-    Attributes:
-        channels: what parameters drift over (``sequence``, or ``time`` in s).
-        places: of each node in each channel (n_k x channels).
-    """
-
-    channels: tuple[str, ...]
-    places: Array
+    channels: tuple[str, ...]  # what parameters drift over (``sequence``, or ``time`` in s)
+    places: Array  # of each node in each channel (n_k x channels)
 
     def nodes(self, dataset: Dataset) -> Indices:
         """Which node each record is at (N); all their places must be on the chain."""
@@ -424,7 +412,6 @@ class Chain:
 
 
 def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
-    """The places of the records of a recording; None where nothing drifts."""
     drifting = _drifting(problem)
     if not drifting:
         return None
@@ -452,12 +439,7 @@ def _drifting(problem: Problem) -> list[tuple[ParameterBlock, Drift]]:
     return [(block, block.drift) for block in problem.parameters.free if block.drift is not None]
 
 
-def with_drift(
-    problem: Problem,
-    dataset: Dataset,
-    values: Array,
-    along: Chain | None = None,
-) -> Problem:
+def with_drift(problem: Problem, dataset: Dataset, values: Array, along: Chain | None = None) -> Problem:
     """The problem of a dataset with its records correlated as drifting parameters demand, by slopes at ``values``.
 
     ``along`` is the chain of a recording that has more records than these.
@@ -490,17 +472,12 @@ LOADS = ("turn_x", "turn_y", "turn_z", "gravity", "mass", "moment_x", "moment_y"
 
 @dataclass(frozen=True)
 class Motion:
-    """Records as an arm goes through them.
-
-    Attributes:
-        slopes: raw residual by these channels, one (n_r x joints x N) array a factor (m/rad and the like).
-        by_load: raw residual by ``LOADS``, one (n_r x 8 x N) array a factor; empty if nothing gives way under loads.
-    """
+    """Records as an arm goes through them."""
 
     channels: tuple[str, ...]  # the command channels of all joints of all arms
-    slopes: tuple[Array, ...]
+    slopes: tuple[Array, ...]  # raw residual by these, one (n_r x joints x N) array a factor (m/rad and the like)
     loads: Mapping[str, SiteLoads]  # of each arm
-    by_load: tuple[Array, ...] = ()
+    by_load: tuple[Array, ...] = ()  # by ``LOADS`` (n_r x 8 x N a factor); empty if nothing gives way under loads
 
     @classmethod
     def of(cls, problem: Problem, values: Array, dataset: Dataset) -> Motion:
