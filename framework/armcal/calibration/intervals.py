@@ -143,7 +143,7 @@ class Uncertainty:
         if self.components:  # with the noise that the calibration estimated
             instruments = {component.name for component in self.components if component.kind == "instrument"}
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
-            estimated = VarianceComponents(self.components, (), (), 0.0)
+            estimated = VarianceComponents(self.components, (), ())
             whitened = apply_components(problem, self.values, estimated, axes)
         by = Predictor(self.values, self.record.symmetric_covariance, self.noise_scale, self.freedom)
         spreads = self._from_either_side(problem, by.spreads(whitened, "new"), commands)

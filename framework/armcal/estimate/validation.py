@@ -51,8 +51,6 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class Split:
-    """Which records train and which judge."""
-
     train: Indices
     holdout: Indices
 
@@ -163,7 +161,6 @@ def _poses(count: int, poses: Indices | None) -> tuple[Indices, int]:
 
 
 def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
-    """Records with these ids train, the others judge."""
     training = set(train_ids)
     missing = sorted(training - set(ids))
     if missing:
@@ -176,7 +173,6 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
 
 
 def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
-    """Records with one of these labels train, the others judge."""
     missing = sorted(set(train) - set(labels))
     if missing:
         raise ProblemError(
@@ -188,7 +184,7 @@ def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
 
 
 def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> tuple[Split, ...]:
-    """Random folds of nearly equal size; every record judges once. Records of one pose (numbers, N) stay together."""
+    """Random folds of nearly equal size; records of one pose (numbers, N) stay together."""
     poses, different = _poses(count, poses)
     if not 2 <= number <= different:
         raise ProblemError(
@@ -219,11 +215,8 @@ class FitTask:
 class JudgedFit:
     """How a fit on the records that train does on those that judge; errors are nan if it did not converge.
 
-    Attributes:
-        held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts);
-            none where no predictions were asked for.
-        unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
-        without: the errors ``at_rest`` without the pose residual that the fit learned; None where it learns none.
+    ``held_residuals`` are raw, of the records that judge, by recording (``new`` only where something drifts); none
+    where no predictions were asked for.
     """
 
     errors: Array  # m
@@ -232,25 +225,21 @@ class JudgedFit:
     converged: bool = True  # whether the fit did
     seconds: float = 0.0  # that it took
     held_residuals: Mapping[Recording, tuple[Array, ...]] = field(default_factory=dict)
-    unknown: tuple[Array, ...] | None = None
-    without: Array | None = None
+    unknown: tuple[Array, ...] | None = None  # covariance by what a pose residual did not know (N x n_r x n_r each)
+    without: Array | None = None  # errors at rest without the pose residual that the fit learned
     values: Array | None = None  # of the fit; None if it did not converge
     gains: Array | None = None  # by how much that makes errors of each measurement smaller at rest (measurements x N)
 
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge).
-
-    ``at_rest`` are the errors if nothing is known of a drift, ``turns`` those of orientations (rad), where measured;
-    ``fits`` those of the folds, in order.
-    """
+    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge)."""
 
     errors: Array
-    at_rest: Array
-    turns: Array | None
+    at_rest: Array  # if nothing is known of a drift
+    turns: Array | None  # of orientations (rad), where measured
     failed_folds: int
-    fits: tuple[JudgedFit, ...] = ()
+    fits: tuple[JudgedFit, ...] = ()  # of the folds, in order
 
 
 def judging(judge: Callable[Concatenate[FitTask, P], JudgedFit]) -> Callable[Concatenate[FitTask, P], JudgedFit]:
@@ -303,13 +292,9 @@ def cross_validate(
 
 @dataclass(frozen=True)
 class Halves:
-    """What fits to either half of the records say, of several divisions; nan where one did not converge.
+    """What fits to either half of the records say, of several divisions; nan where one did not converge."""
 
-    Attributes:
-        apart: how far the pose of each measurement that is ``Placed`` differs between the two (mm, deg; K x 2).
-    """
-
-    apart: Mapping[str, Array]
+    apart: Mapping[str, Array]  # by how much the poses of measurements that are ``Placed`` differ (mm, deg; K x 2)
     errors: Array  # of records by the fit to the other half, on average (K; thousandths, as errors are shown)
 
 
@@ -382,8 +367,7 @@ def _row_length(row: Array) -> int:
 def standard_error_of_mean(series: Array, block: int) -> float:
     """The standard deviation of the mean of a series (N) over its resamples in circular blocks, in closed form.
 
-    That of one block's mean, times the square root of block length over N; corrected so that blocks of one record
-    give the usual standard error of independent ones.
+    Corrected so that blocks of one record give the usual standard error of independent ones.
     """
     count = len(series)
     if count < 2:
@@ -418,8 +402,6 @@ class BootstrapSettings(Settings):
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Refits to resampled records."""
-
     names: tuple[str, ...]  # of the free canonical entries
     values: Array  # of each refit that converged (B x n)
     block: int  # how many neighbours were drawn together
@@ -427,12 +409,10 @@ class Bootstrap:
 
     @property
     def deviations(self) -> Array:
-        """Standard deviations over the refits (n); not a number with too few of them."""
         return self.values.std(axis=0, ddof=1) if self._enough else np.full(len(self.names), np.nan)
 
     @property
     def intervals(self) -> Array:
-        """95 % percentile intervals (n x 2); not a number with too few refits."""
         if not self._enough:
             return np.full((len(self.names), 2), np.nan)
         tail = 50 * (1 - CONFIDENCE)
@@ -475,7 +455,6 @@ def bootstrap(
 
 
 def _refit(problem: Problem, estimator: Estimator, start: Array, resample: tuple[Indices, Array]) -> Array | None:
-    """The values of one refit to some records, each so often; None if it did not converge."""
     chosen, weights = resample
     some = problem.subset(chosen)
     try:

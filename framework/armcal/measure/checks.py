@@ -213,16 +213,13 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
         spared = layout.parts.get(channel) or channel in layout.evidence
         lost |= np.isinf(values) if spared else ~np.isfinite(values)
     faulty = {int(index): _reason(dataset, layout, int(index)) for index in np.flatnonzero(lost)}
-    why = f"values are missing or not finite: {_missing(dataset.subset(np.flatnonzero(lost)), layout)}"
+    counts = {name: int(np.sum(~np.isfinite(values[lost]))) for name, values in dataset.channels.items()}
+    most = sorted((name for name, count in counts.items() if count), key=lambda name: -counts[name])
+    listed = ", ".join(f"{layout.column(name)} in {counts[name]}" for name in most[:_MOST_COUNTED])
+    more = f" and {len(most) - _MOST_COUNTED} columns more" if len(most) > _MOST_COUNTED else ""
+    why = f"values are missing or not finite: {listed}{more}"
     kept = set_aside(dataset, layout, faulty, why, "Fill them in, or measure these again.")
     return _without_incomplete(kept, layout, {part: mask[~lost] for part, mask in complete.items()})
-
-
-def _missing(dataset: Dataset, layout: Layout) -> str:
-    counts = {name: int(np.sum(~np.isfinite(values))) for name, values in dataset.channels.items()}
-    most = sorted((name for name, count in counts.items() if count), key=lambda name: -counts[name])
-    more = f" and {len(most) - _MOST_COUNTED} columns more" if len(most) > _MOST_COUNTED else ""
-    return ", ".join(f"{layout.column(name)} in {counts[name]}" for name in most[:_MOST_COUNTED]) + more
 
 
 def _reason(dataset: Dataset, layout: Layout, index: int) -> str:

@@ -503,7 +503,8 @@ def _columns(
     written: dict[str, Sequence[str]] = {}
     for channel, (column, unit) in names.items():
         values = to_unit(dataset.channels[channel], unit).tolist()
-        written[column] = [_text(int(x) if unit == "1" and x.is_integer() else x) for x in values]
+        numbers = [int(x) if unit == "1" and x.is_integer() else x for x in values]
+        written[column] = ["" if math.isnan(number) else repr(number) for number in numbers]
     for name, texts in [*written.items(), *dataset.extra.items()]:
         if name in columns:
             raise DataError(
@@ -531,10 +532,6 @@ def column_names(
                 raise ValueError(f"{unit!r} is not a unit of {w.dimension}; expected one of {', '.join(known)}.")
         columns[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
     return columns
-
-
-def _text(number: float) -> str:
-    return "" if math.isnan(number) else repr(number)
 
 
 def csv_text(rows: Iterable[Iterable[object]], number: str = ".6f") -> str:

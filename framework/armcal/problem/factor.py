@@ -162,18 +162,15 @@ class _Records:
     """A symbol for each channel that an expression reads, in the order in which they are read first."""
 
     def __init__(self, available: frozenset[str]) -> None:
-        self._available = available
+        self.available = available
         self.symbols: dict[str, Expression] = {}
         self.kept: set[str] = set()  # what pose residuals read
-
-    def has(self, channel: str) -> bool:
-        return channel in self._available
 
     def number(self, channel: str) -> Expression:
         return self.symbols.setdefault(channel, ca.SX.sym(channel))
 
     def optional(self, channel: str, default: float) -> Expression:
-        return self.number(channel) if channel in self._available else ca.SX(default)
+        return self.number(channel) if channel in self.available else ca.SX(default)
 
     def used_by(self, expression: Expression) -> dict[str, Expression]:
         return {n: own for n, own in self.symbols.items() if n in self.kept or ca.depends_on(expression, own)}
@@ -191,7 +188,9 @@ def build_factor(
     """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest.
 
     ``unrolled`` has those of all points of a measurement of many, as if it had no points."""
-    symbols, values = _free_and_fixed(parameters)
+    # Each block's value is a number where it is fixed; nuisances are left out.
+    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
+    values |= {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
@@ -199,8 +198,10 @@ def build_factor(
     reading = _reading(name, measurement, records, states, local, unrolled)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    nuisance_names, nuisance_starts = _nuisance_starts(groups, states, local)
-    used = records.used_by(ca.vertcat(reading.everything, next_state, tools, nuisance_starts))
+    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
+    nuisance_starts = ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
+    margin = ca.SX(0, 1) if reading.margin is None else reading.margin
+    used = records.used_by(ca.vertcat(reading.outputs, reading.residual, margin, next_state, tools, nuisance_starts))
     own = [(arm_name, arms[arm_name.removesuffix(OTHER)]) for arm_name in measurement.arms]
     factor = Factor(
         name=name,
@@ -218,27 +219,12 @@ def build_factor(
         dimensions=residual_dimensions(measurement),
         margin=reading.margin,
         nuisance_starts=nuisance_starts,
-        nuisance_names=nuisance_names,
+        nuisance_names=tuple(n for n, entries in starts.items() for _ in range(entries.numel())),
         mean_weight=groups.mean_weight if groups else 1.0,
         springs=tuple(spring for _, arm in own for spring in arm.spring_names),
         joints=tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in own for j, d in a.commanded.items()),
     )
     return factor if reading.points is None else _of_points(factor, measurement, reading.points)
-
-
-def _free_and_fixed(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
-    """Symbols of the free entries, and each block's value, a number where it is fixed; nuisances are left out."""
-    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
-    fixed = {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
-    return symbols, {**values, **fixed}
-
-
-def _nuisance_starts(
-    groups: GroupedMeasurement | None, states: Mapping[str, ArmState], local: Mapping[str, Expression]
-) -> tuple[tuple[str, ...], Expression]:
-    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
-    names = tuple(n for n, entries in starts.items() for _ in range(entries.numel()))
-    return names, ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
 
 
 @dataclass(frozen=True)
@@ -250,10 +236,6 @@ class _Reading:
     residual: Expression
     margin: Expression = None
     points: Array | None = None
-
-    @property
-    def everything(self) -> Expression:
-        return ca.vertcat(self.outputs, self.residual, ca.SX(0, 1) if self.margin is None else self.margin)
 
 
 def _reading(
@@ -272,7 +254,7 @@ def _reading(
     points = measurement.points
     point = ca.vertcat(*[records.number(f"{name}.{_POINT}{i}") for i in range(points.shape[1])])
     shown, own = measurement.point_outputs(states, local, point), [c.name for c in measurement.point_channels()]
-    is_read = any(records.has(f"{name}.{channel.name}") for channel in measurement.channels())
+    is_read = any(f"{name}.{channel.name}" in records.available for channel in measurement.channels())
     read = [records.number(f"{name}.{channel}") if is_read else ca.SX(0) for channel in own]
     margin = measurement.point_margin(states, local, point) if isinstance(measurement, LimitedView) else None
     return _Reading(tuple(own), shown, ca.vertcat(*read) - shown, margin, points)

@@ -75,16 +75,6 @@ class ExtraRows:
     residual: Array
     jacobian: Array
 
-    @property
-    def cost(self) -> float:
-        return 0.5 * float(self.residual @ self.residual)
-
-    def added_to(self, equations: NormalEquations) -> NormalEquations:
-        by_residual, products = self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
-        return NormalEquations(
-            equations.cost + self.cost, equations.gradient + by_residual, equations.hessian + products
-        )
-
 
 def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
     residual = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
@@ -118,11 +108,6 @@ class TieFunction:
         second = ca.densify(ca.hessian(ca.dot(factors, residual), symbols)[0])
         bend = ca.Function("tie_bend", [symbols, factors], [second])
         return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
-
-    @property
-    def sides(self) -> tuple[Indices, Indices]:
-        half = len(self.entries) // 2
-        return self.entries[:half], self.entries[half:]
 
     def residual(self, values: Array) -> Array:
         """What is left open at a value vector (m or rad)."""
@@ -245,7 +230,7 @@ class Compiled:
         A group held because no record belongs to it is not known: a tie to where it starts would be invented.
         """
         free, could = set(self.parameters.free_entries), set(self.blueprint.parameters.free_entries)
-        sides = [[set(side.tolist()) for side in tie.sides] for tie in self.known_ties]
+        sides = [[set(side.tolist()) for side in np.split(tie.entries, 2)] for tie in self.known_ties]
         return tuple(
             tie
             for tie, both in zip(self.known_ties, sides, strict=True)
@@ -425,7 +410,7 @@ class Problem:
     def cost(self, values: Array) -> float:
         """Half the weighted squared whitened residuals."""
         raw, shared = self.residuals(values), self.correlation
-        weighted = self._weighted(self.whitened(raw))
+        weighted = self.weighted_residuals(values, raw)
         if shared is not None:
             weighted = shared.independent([residual[:, :, None] for residual in weighted])
         total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
@@ -435,10 +420,8 @@ class Problem:
                 total += 0.5 * float(np.sum((declared_ones @ share[: record.count]) ** 2))
         return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
 
-    def weighted_residuals(self, values: Array) -> tuple[Array, ...]:
-        return self._weighted(self.whitened_residuals(values))
-
-    def _weighted(self, whitened: Sequence[Array]) -> tuple[Array, ...]:
+    def weighted_residuals(self, values: Array, raw: Sequence[Array] | None = None) -> tuple[Array, ...]:
+        whitened = self.whitened(self.residuals(values) if raw is None else raw)
         pairs = zip(self.records, whitened, strict=True)
         return tuple(residual * np.sqrt(record.weight[: record.count]) for record, residual in pairs)
 
@@ -466,7 +449,10 @@ class Problem:
             cost += 0.5 * float(np.sum(residual**2))
             gradient = gradient + np.einsum("kvb,kb->v", jacobian, residual)
             hessian = hessian + sum((part @ part.T for part in jacobian), np.zeros((entries, entries)))
-        return self._extra(values).added_to(NormalEquations(cost, gradient, hessian))
+        extra = self._extra(values)
+        cost += 0.5 * float(extra.residual @ extra.residual)
+        gradient = gradient + extra.jacobian.T @ extra.residual
+        return NormalEquations(cost, gradient, hessian + extra.jacobian.T @ extra.jacobian)
 
     def triangular_factor(self, values: Array) -> Array:
         """R with R'R = J'J of the whitened residuals by coordinates: singular values keep their condition."""

@@ -184,7 +184,10 @@ def _whitening(factor: Factor, dataset: Dataset, fill: Indices) -> Array | None:
     if not any(stated):
         return None
     pairs = zip(stated, factor.noise, strict=True)
-    return by_deviation(np.array([dataset.column(c)[fill] if c else np.full(len(fill), sd) for c, sd in pairs]))
+    deviations = np.array([dataset.column(c)[fill] if c else np.full(len(fill), sd) for c, sd in pairs])
+    whitening = np.zeros((len(deviations), *deviations.shape))
+    whitening[np.arange(len(deviations)), np.arange(len(deviations))] = 1 / deviations
+    return whitening
 
 
 def declared(noise: Sequence[float]) -> Array:
@@ -201,13 +204,6 @@ def whitening_of(factor: Factor, records: FactorRecords) -> Array:
 def noise_roots(factor: Factor, records: FactorRecords) -> Array:
     """L with L L' the covariance of each record's residual, as it states it or as declared (N x n_r x n_r; SI)."""
     return np.asarray(np.linalg.inv(np.moveaxis(whitening_of(factor, records)[:, :, : records.count], 2, 0)))
-
-
-def by_deviation(deviations: Array) -> Array:
-    count = len(deviations)
-    whitening = np.zeros((count, *deviations.shape))
-    whitening[np.arange(count), np.arange(count)] = 1 / deviations
-    return whitening
 
 
 def by_covariance(covariances: Array) -> Array:

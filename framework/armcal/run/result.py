@@ -81,7 +81,7 @@ def noise_content(fit: Fit, suspicious: Sequence[SuspiciousRecord]) -> dict[str,
     fitted, estimate = fit.fitted, fit.estimate
     content: dict[str, Any] = {"loss": fitted.loss}
     if fitted.loss != "none":
-        content["rounds"] = len(fitted.rounds)
+        content["rounds"] = fitted.rounds
         content["suspicious_records"] = [asdict(record) for record in suspicious]
     if fitted.components is not None:
         content["components"] = [finite(asdict(component)) for component in fitted.components.components]
