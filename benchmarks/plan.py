@@ -13,9 +13,8 @@ import numpy as np
 from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.functions.batch_function import EvaluatorChoice
-from armcal.planning.candidates import Candidates, efficiency, value_of, whitened_rows
+from armcal.planning.candidates import Candidates, Task, efficiency, value_of, whitened_rows
 from armcal.planning.exchange import Plan, choose, detmax
-from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from armcal.api import Experiment, Run
 from armcal.base.dataset import Dataset
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation

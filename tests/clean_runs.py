@@ -26,8 +26,8 @@ from armcal.config.yaml_source import load_config
 from armcal.diagnose.checks import DATA_CHECKS, FIT_CHECKS
 from armcal.errors import ArmcalError
 from armcal.estimate.simulation import SimulationRequest
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import requested_channels
+from armcal.measure.tables import write_csv
 from armcal.plugins import use_plugins
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate

@@ -15,8 +15,8 @@ from armcal.base.dataset import Dataset
 from armcal.cli.main import cli
 from armcal.errors import ArmcalError, NotConvergedError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import requested_channels
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode

@@ -18,8 +18,8 @@ from armcal.base.units import from_unit
 from armcal.errors import DataError, Location
 from armcal.io.parallel import Executor, Report
 from armcal.io.plain_files import input_bytes, refuse
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest
+from armcal.measure.tables import write_csv
 from pydantic import Field
 
 from armcal_camera.board import Board

@@ -31,9 +31,9 @@ from armcal.estimate.prediction import RADIUS_LEVEL, Spread, quantile
 from armcal.estimate.start import BETTER, FAR, pose_words
 from armcal.io.plain_files import reserved
 from armcal.measure.checks import noticed, records_of
-from armcal.measure.csv_writer import csv_text
 from armcal.measure.groups import pose_numbers
 from armcal.measure.reader import CYCLE, Reader, ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.tables import csv_text
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import FEWEST, Sighting, Tools, alignments, sighting_of, tools_of, undetermined

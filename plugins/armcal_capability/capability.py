@@ -10,7 +10,7 @@ import numpy as np
 from armcal.base.config_text import as_json
 from armcal.cli.common import Console, command_line, overrides, speaking
 from armcal.io.plain_files import reserved
-from armcal.measure.csv_writer import csv_text
+from armcal.measure.tables import csv_text
 from armcal.report.document import Document, Section, Table
 from armcal.report.numbers import count
 

@@ -12,8 +12,8 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import DataError, InputError, Location
 from armcal.io.plain_files import write_over
-from armcal.measure.csv_writer import csv_text
 from armcal.measure.rests import StillSettings, last_motions, rests
+from armcal.measure.tables import csv_text
 from armcal.plugins import library
 
 from armcal_lerobot.motor_files import MotorFile, Units, is_gripper, read_json, require_motors, wiring_of

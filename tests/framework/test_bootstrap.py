@@ -12,7 +12,7 @@ from armcal.cli.main import cli
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Solution, SolverVerdict, estimate
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
-from armcal.estimate.uncertainty import (
+from armcal.estimate.validation import (
     BootstrapSettings,
     automatic_block_length,
     bootstrap,

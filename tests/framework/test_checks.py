@@ -13,8 +13,8 @@ from armcal.base.units import from_unit
 from armcal.errors import EXIT_BAD_INPUT, DataError, InputError, Location
 from armcal.measure import checks
 from armcal.measure.checks import Layout, check_dataset, layout_of, refuse_joint_count, set_aside_not_finite
-from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.reader import RequestedChannel
+from armcal.measure.tables import column_names, write_csv
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from armcal.cli.main import cli
 from armcal.estimate.identifiability import candidates, freeing
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.plugins import discover
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import requested_channels
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal_mdh.model import MdhModel

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.diagnose.residual_structure import Carrier, Predicted, _remedies
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 

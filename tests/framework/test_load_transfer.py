@@ -127,7 +127,7 @@ def test_records_that_were_measured_give_what_their_simulation_gave(place: Path,
     simulated = _run(place / "study.yaml")
     out = place / "out"
     assert armcal("study", str(place / "study.yaml"), "--out", str(out)).exit_code == 0
-    from armcal.measure.csv_writer import write_csv
+    from armcal.measure.tables import write_csv
 
     experiment = Study.load(place / "study.yaml").experiments["elastic"]
     data = tmp_path / "measured.csv"

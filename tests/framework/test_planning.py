@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import deviations
-from armcal.planning.candidates import Candidates, value_of, whitened_rows
+from armcal.planning.candidates import AT_ONCE, Candidates, Task, value_of, whitened_rows
 from armcal.planning.exchange import Tally, built_up, choose, detmax, in_order
-from armcal.planning.relaxation import AT_ONCE, Task
 
 
 def made(count=30, n_rows=3, size=5, known=2, seed=0) -> Candidates:

@@ -29,8 +29,7 @@ from armcal.estimate.prediction import LEVELS, Spread
 from armcal.estimate.robust import fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels
 from armcal.estimate.validation import folds
-from armcal.problem.motion import recorded_position
-from armcal.problem.variants import with_drift
+from armcal.problem.variants import recorded_position, with_drift
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, calibrate, prepare
 from click.testing import CliRunner, Result

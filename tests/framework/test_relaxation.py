@@ -6,10 +6,18 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from armcal.planning import relaxation
-from armcal.planning.candidates import Candidates, efficiency, log_determinant, value_of
+from armcal.planning import candidates
+from armcal.planning.candidates import (
+    Candidates,
+    Task,
+    certified,
+    efficiency,
+    log_determinant,
+    relax,
+    tangent,
+    value_of,
+)
 from armcal.planning.exchange import choose
-from armcal.planning.relaxation import Task, certified, relax, tangent
 
 
 def task_of(count=12, size=4, poses=4, seed=0, known=1) -> Task:
@@ -78,14 +86,14 @@ def test_gradient_and_curvature_are_those_of_finite_differences() -> None:
     task = task_of(count=8, seed=3)
     weights = np.random.default_rng(1).uniform(0.2, 0.9, 8)
 
-    gradient, half = relaxation._derivatives(task, weights)
+    gradient, half = candidates._derivatives(task, weights)
     step = 1e-4
     for i in range(8):
         e = np.eye(8)[i] * step
         assert (value_at(task, weights + e) - value_at(task, weights - e)) / (2 * step) == pytest.approx(
             gradient[i], rel=1e-5
         )
-        ahead, behind = (relaxation._derivatives(task, weights + s * e)[0] for s in (1, -1))
+        ahead, behind = (candidates._derivatives(task, weights + s * e)[0] for s in (1, -1))
         assert np.allclose((ahead - behind) / (2 * step), -(half @ half.T)[i], rtol=1e-4, atol=1e-6)
 
 

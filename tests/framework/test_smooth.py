@@ -21,7 +21,7 @@ from armcal.diagnose.residual_structure import (
 )
 from armcal.estimate.robust import fit
 from armcal.measure.groups import pose_numbers
-from armcal.problem.motion import Motion
+from armcal.problem.variants import Motion
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
 from fits import fit_of, fit_that_left

@@ -13,7 +13,7 @@ from armcal.base.parameters import Parameters
 from armcal.calibration.tool_expression import Equilibrium, arm_expression
 from armcal.config.selection import with_values
 from armcal.config.yaml_source import load_config
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "so101"
 LIMITS_DEG = ((-80, 80), (-40, 50), (-50, 60), (-60, 80), (-90, 90))

@@ -80,12 +80,11 @@ def test_the_average_information_is_half_the_quadratic_form():
 
 def test_the_maximum_is_one():
     term, prior = linear_case(3, count=100), np.zeros(6)
-    found = maximise([term], prior, np.array([True, False]))
+    theta, _ = maximise([term], prior, np.array([True, False]))
     for factor in (0.97, 1.03):
         for i in range(2):
-            beside = found.theta * np.where(np.arange(2) == i, factor, 1.0)
-            assert whole(term, beside, prior) < whole(term, found.theta, prior) + 1e-6
-    assert found.log_likelihood == pytest.approx(_evaluate([term], prior, found.theta).value)
+            beside = theta * np.where(np.arange(2) == i, factor, 1.0)
+            assert whole(term, beside, prior) < whole(term, theta, prior) + 1e-6
 
 
 def test_a_component_that_is_not_there_ends_at_zero():
@@ -94,9 +93,9 @@ def test_a_component_that_is_not_there_ends_at_zero():
     for _ in range(20):
         term = linear_case(5, count=60)
         term = replace(term, target=rng.normal(size=(60, 3)))
-        found = maximise([term], np.zeros(6), np.array([True, False]))
-        assert found.theta[1] >= 0
-        ended += found.theta[1] < 1e-9
+        theta, _ = maximise([term], np.zeros(6), np.array([True, False]))
+        assert theta[1] >= 0
+        ended += theta[1] < 1e-9
     assert 4 <= ended <= 16  # on a boundary an estimate ends half of the time
 
 

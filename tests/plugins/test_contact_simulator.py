@@ -12,8 +12,8 @@ from armcal.errors import ConfigError
 from armcal.estimate.estimator import estimate
 from armcal.estimate.polish import started
 from armcal.estimate.simulation import SimulationRequest
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, requested_channels
+from armcal.measure.tables import write_csv
 from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import ClampedTool, PlaneContact
 from armcal_dualarm.closure import ClosedChain

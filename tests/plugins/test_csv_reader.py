@@ -16,9 +16,8 @@ from armcal.base.units import from_unit
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.errors import EXIT_BAD_INPUT, DataError
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ENVIRONMENT, ReadRequest, RequestedChannel, requested_channels
-from armcal.measure.tables import MAX_BYTES
+from armcal.measure.tables import MAX_BYTES, write_csv
 from armcal_mdh.model import MdhModel, MdhSettings, Row
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from armcal_tracker.position import TipPosition, TipPositionSettings

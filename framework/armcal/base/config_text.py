@@ -11,15 +11,10 @@ from armcal.errors import ConfigError, Location
 
 
 class ConfigText(str):
-    """A text scalar of a config.
-
-    Attributes:
-        base_dir: what a relative path in it is relative to: the directory of its file; for a value from the
-            command line the working directory.
-    """
+    """A text scalar of a config, which remembers where it was written."""
 
     location: Location  # where it was written
-    base_dir: Path
+    base_dir: Path  # of a relative path in it: that of its file; of a value from the command line the working directory
     root: Path | None  # the directory that a path in it may not leave; None: anywhere (from the command line)
 
     def __new__(
@@ -29,7 +24,6 @@ class ConfigText(str):
         base_dir: Path | None = None,
         root: Path | None = None,
     ) -> Self:
-        """Wrap a text; without a directory it is relative to the working directory."""
         made = super().__new__(cls, text)
         made.location = location or Location()
         made.base_dir = base_dir or Path.cwd()
@@ -57,7 +51,6 @@ def as_json(content: Any, indent: int | None = 2) -> str:
 
 
 def finite(value: Any) -> Any:
-    """The same as JSON can hold it: null for a number that is not finite."""
     if isinstance(value, Mapping):
         return {str(key): finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -68,9 +61,7 @@ def finite(value: Any) -> Any:
 def resolve_path(text: ConfigText | str) -> Path:
     """The absolute path that a config's text names; it need not exist.
 
-    Args:
-        text: relative to the directory of the file it was written in; an ordinary ``str`` is relative to the
-            working directory and may name any place.
+    An ordinary ``str`` is relative to the working directory and may name any place.
 
     Raises:
         ConfigError: not a path, or outside the root once symbolic links are followed.
@@ -119,8 +110,7 @@ _STEERING = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 def shown(text: str, keep: str = "\n\t") -> str:
     """A text without characters that steer whatever shows it: ``\\x1b`` stands for an escape character.
 
-    Names, cells and messages of files are data, and whoever wrote them must not move a cursor, colour a line, hide a
-    name or end an XML file. ``keep`` are the characters that stay as they are.
+    Names, cells and messages of files are data: they must not move a cursor, colour a line or end an XML file.
     """
     if text.isascii() and text.isprintable():
         return text

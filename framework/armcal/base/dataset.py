@@ -21,27 +21,16 @@ class SetAside:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Records as columns.
+    """Records as columns."""
 
-    Attributes:
-        ids: one a record, as written in the source.
-        channels: SI values by channel name (``arm.q1``, ``tracker.x``, ``gravity_z``), each of length N.
-        extra: columns that nothing asked for, kept as text.
-        rows: where each record stood in its source (from 1; a CSV's line).
-        source: a file name or what made the records.
-        sha256: of the source's bytes; empty if there were none.
-        set_aside: records left out on reading.
-        warnings: what a user should know before trusting the data.
-    """
-
-    ids: tuple[str, ...]
-    channels: Mapping[str, Array]
-    extra: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    rows: tuple[int, ...] = ()
-    source: str = ""
-    sha256: str = ""
-    set_aside: tuple[SetAside, ...] = ()
-    warnings: tuple[str, ...] = ()
+    ids: tuple[str, ...]  # one a record, as written in the source
+    channels: Mapping[str, Array]  # SI values by name (``arm.q1``, ``tracker.x``, ``gravity_z``), each of length N
+    extra: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # columns that nothing asked for, kept as text
+    rows: tuple[int, ...] = ()  # where each record stood in its source (from 1; a CSV's line)
+    source: str = ""  # a file name or what made the records
+    sha256: str = ""  # of the source's bytes; empty if there were none
+    set_aside: tuple[SetAside, ...] = ()  # records left out on reading
+    warnings: tuple[str, ...] = ()  # what a user should know before trusting the data
 
     @classmethod
     def of_rows(cls, channels: Sequence[str], rows: Sequence[Sequence[float]], source: str) -> Self:

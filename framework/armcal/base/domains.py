@@ -25,10 +25,7 @@ _SYMMETRIC = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class Domain(ABC):
-    """What a parameter block needs to know of its own shape.
-
-    Coordinates are increments where a domain says no other.
-    """
+    """What a parameter block needs to know of its own shape; coordinates are increments where it says no other."""
 
     entries: ClassVar[tuple[str, ...]]  # suffix of each canonical number; one empty suffix for a scalar
     increments: ClassVar[tuple[str, ...]]  # a short name for each number of an increment
@@ -89,22 +86,18 @@ class Interval(Domain):
     upper: float = math.inf
 
     def check(self, value: Array) -> str:
-        """Within the bounds."""
         if not math.isfinite(value[0]):
             return f"{value[0]} is not a finite number"
         inside = self.lower <= value[0] <= self.upper
         return "" if inside else f"{value[0]:g} is outside {self.lower:g} to {self.upper:g}"
 
     def retract(self, base: Array, delta: Array) -> Array:
-        """Addition."""
         return np.asarray(base + delta)
 
     def local(self, base: Array, value: Array) -> Array:
-        """Subtraction."""
         return np.asarray(value - base)
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
-        """One."""
         return np.eye(1)
 
 
@@ -124,7 +117,6 @@ class Rotation(Domain):
         return np.asarray(product / np.linalg.norm(product))
 
     def local(self, base: Array, value: Array) -> Array:
-        """log(base^-1 * value)."""
         return quaternion_log(quaternion_matrix(base * np.array([1, -1, -1, -1])) @ value)
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
@@ -147,12 +139,10 @@ class Pose(Domain):
         return np.concatenate([Rotation().retract(base[:4], delta[:3]), moved])
 
     def local(self, base: Array, value: Array) -> Array:
-        """The inverse of ``retract``."""
         shift = rotation_matrix(base[:4]).T @ (value[4:] - base[4:])
         return np.concatenate([Rotation().local(base[:4], value[:4]), shift])
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
-        """Block diagonal (7 x 6)."""
         jacobian = np.zeros((7, 6))
         jacobian[:4, :3] = Rotation().retract_jacobian(base[:4], delta[:3])
         jacobian[4:, 3:] = rotation_matrix(base[:4])
@@ -184,7 +174,6 @@ class ScrewAxis(Domain):
         return np.concatenate([direction, np.cross(nearest + across @ delta[2:], direction)])
 
     def local(self, base: Array, value: Array) -> Array:
-        """The inverse of ``retract``."""
         across, nearest = two_across(base[:3]), np.cross(base[:3], base[3:])
         turn_axis = np.cross(base[:3], value[:3])
         sine, cosine = float(np.linalg.norm(turn_axis)), float(base[:3] @ value[:3])
@@ -196,7 +185,6 @@ class ScrewAxis(Domain):
         return np.concatenate([turn, across.T @ (foot - nearest)])
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
-        """6 x 4."""
         across, nearest = two_across(base[:3]), np.cross(base[:3], base[3:])
         direction, point = self.retract(base, delta)[:3], nearest + across @ delta[2:]
         turning = left_jacobian(across @ delta[:2]) @ across
@@ -230,7 +218,6 @@ class Direction(Domain):
         return np.asarray(two_across(base).T @ turn_axis * (math.atan2(sine, cosine) / sine if sine > 1e-12 else 1.0))
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
-        """3 x 2."""
         across = two_across(base)
         turning = left_jacobian(across @ delta) @ across
         return np.asarray(np.cross(turning.T, self.retract(base, delta)).T)
@@ -264,7 +251,6 @@ class Semidefinite(Domain):
         return _entries(_root(value) - _root(base))
 
     def retract_jacobian(self, base: Array, delta: Array) -> Array:
-        """6 x 6."""
         root = _root(base) + symmetric(delta)
         return np.column_stack([_entries(root @ unit + unit @ root) for unit in _UNITS])
 
@@ -278,7 +264,6 @@ class Semidefinite(Domain):
         return self.local(base, base + coordinates)
 
     def coordinates_jacobian(self, base: Array, delta: Array) -> Array:
-        """6 x 6."""
         return self.retract_jacobian(base, delta)
 
     def entries_jacobian(self, base: Array, delta: Array) -> Array:

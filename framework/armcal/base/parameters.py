@@ -39,28 +39,19 @@ class Drift:
 class ParameterBlock:
     """One named parameter.
 
-    Attributes:
-        name: instance, component and local name: ``arm.mdh.theta3``.
-        unit: SI unit of its increments, and so of its prior (``m``, ``rad``, ``rad_per_Nm``, ``kg``, ``1``).
-        nominal: canonical entries of the nominal value.
-        domain: where it lives.
-        scale: the size of a correction one would call ordinary, in ``unit``; conditions the solver and the rank
-            decision, never the answer.
-        free: whether the fit may move it.
-        prior_sd: standard deviation of a Gaussian prior about the nominal value, per coordinate; None for no prior.
-        drift: how it moves over a recording; None if it does not.
-        nuisance: whether it belongs to one group of records (a socket, a clamp): found with the rest, of no use after.
+    ``scale`` is the size of a correction one would call ordinary; it conditions the solver and the rank decision, never
+    the answer.
     """
 
-    name: str
-    unit: str
-    nominal: tuple[float, ...]
+    name: str  # instance, component and local name: ``arm.mdh.theta3``
+    unit: str  # SI unit of its increments, its prior and its scale (``m``, ``rad``, ``rad_per_Nm``, ``kg``, ``1``)
+    nominal: tuple[float, ...]  # canonical entries
     domain: Domain = field(default_factory=Interval)
     scale: float = 1.0
-    free: bool = False
-    prior_sd: float | None = None
-    drift: Drift | None = None
-    nuisance: bool = False
+    free: bool = False  # whether the fit may move it
+    prior_sd: float | None = None  # of a Gaussian prior about the nominal value, per coordinate; None for no prior
+    drift: Drift | None = None  # how it moves over a recording; None if it does not
+    nuisance: bool = False  # whether it belongs to one group of records (a socket, a clamp), and is of no use after
 
     @property
     def entry_names(self) -> tuple[str, ...]:
@@ -87,8 +78,6 @@ def scalar(name: str, unit: str, nominal: float, scale: float, domain: Interval 
 
 
 class DeclaresParameters(Protocol):
-    """A component with parameters."""
-
     def parameters(self) -> Sequence[ParameterBlock]:
         """Its blocks, under local names."""
 
@@ -125,14 +114,9 @@ def _check_blocks(method: Callable[..., Any], blocks: Sequence[ParameterBlock]) 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the numbers of free blocks stand.
+    """Where the numbers of free blocks stand: in a value vector, among the free entries, and among the increments."""
 
-    Attributes:
-        places, entries, increments: of blocks that are numbers: in a value vector, among the free entries, and among
-            the increments.
-    """
-
-    places: Indices
+    places: Indices  # of blocks that are numbers
     entries: Indices
     increments: Indices
     others: tuple[tuple[ParameterBlock, slice, slice, slice], ...]  # each other free block, with the same three
@@ -141,10 +125,7 @@ class _Layout:
 
 @dataclass(frozen=True)
 class Parameters:
-    """All blocks of a problem, in a fixed order.
-
-    Value vectors (``values``) hold the canonical entries of all blocks, free and fixed, in that order.
-    """
+    """All blocks of a problem in a fixed order; value vectors hold the canonical entries of all, free and fixed."""
 
     blocks: tuple[ParameterBlock, ...]
 
@@ -159,12 +140,10 @@ class Parameters:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names of the blocks."""
         return tuple(block.name for block in self.blocks)
 
     @cached_property
     def entry_names(self) -> tuple[str, ...]:
-        """The names of all canonical entries."""
         return tuple(name for block in self.blocks for name in block.entry_names)
 
     @cached_property
@@ -229,7 +208,6 @@ class Parameters:
 
     @cached_property
     def free(self) -> tuple[ParameterBlock, ...]:
-        """The free blocks."""
         return tuple(block for block in self.blocks if block.free)
 
     @cached_property

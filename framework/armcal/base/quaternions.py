@@ -59,11 +59,7 @@ def rotation_matrix(q: Array) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The proper rotation nearest to a printed one (3x3). [Higham1989]
-
-    Raises:
-        ValueError: it is no rotation, not even a printed one.
-    """
+    """The proper rotation nearest to a printed one (3x3); ValueError if that is no rotation. [Higham1989]"""
     left, _, right = np.linalg.svd(matrix)
     nearest = left @ right
     if np.linalg.det(nearest) < 0:

@@ -55,17 +55,12 @@ class Transform:
         return Transform(back, -ca.mtimes(back, self.translation))
 
     def matrix(self) -> Expression:
-        """The homogeneous 4x4 matrix."""
         bottom = ca.horzcat(ca.SX(1, 3), ca.SX(1))
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), bottom)
 
 
 def column(method: Callable[..., Any], returned: Any, rows: int | None, expected: str) -> Expression:
-    """What a method of a component returned, as an expression (rows x 1, of any length if None).
-
-    Raises:
-        PluginError: it is none, or of another shape; with the method and its place.
-    """
+    """What a method of a component returned, as an expression (rows x 1, any length if None); or a PluginError."""
     try:
         given = ca.SX(returned)
     except (NotImplementedError, TypeError):
@@ -90,10 +85,9 @@ def translation(x: Expression, y: Expression, z: Expression) -> Transform:
 
 
 def cos_sin(angle: Expression) -> tuple[Expression, Expression]:
-    """Cosine and sine of an angle (rad); exact for constant multiples of a right angle.
+    """Cosine and sine of an angle (rad), exact for constant multiples of a right angle.
 
-    cos(pi/2) in floating point is 6e-17: as a factor it would cost operations in every expression
-    after it and mean nothing.
+    cos(pi/2) in floating point is 6e-17, which as a factor would cost operations everywhere after it and mean nothing.
     """
     angle = ca.SX(angle)
     if angle.is_constant():
@@ -138,8 +132,8 @@ def rotation_about_unit(axis: Expression, angle: Expression) -> Expression:
 def small_rotation(vector: Expression) -> Expression:
     """The rotation matrix of a rotation vector (3x1, rad), smooth at zero.
 
-    Rodrigues' formula [Murray1994] with both of its coefficients as power series in the squared angle:
-    exact to double precision below one radian, far more than an elastic deflection or an increment is.
+    Rodrigues' formula [Murray1994] with both of its coefficients as power series in the squared angle: exact to double
+    precision below one radian, far more than an elastic deflection or an increment is.
     """
     squared = ca.dot(vector, vector)
     sinc, versine = ca.SX(0), ca.SX(0)
@@ -173,10 +167,9 @@ def rotation_vector(rotation: Expression) -> Expression:
 
 
 def screw_motion(angular: Expression, linear: Expression, displacement: Expression) -> Transform:
-    """exp(screw * displacement) for a unit revolute screw through the origin, or a prismatic one.
+    """exp(screw * displacement) of a unit revolute screw through the origin, or a prismatic one. [Murray1994]
 
-    ``angular`` is a unit vector (3x1) or structurally zero; ``linear`` (3x1) is the direction of a
-    prismatic joint. [Murray1994]
+    ``angular`` is a unit vector (3x1) or structurally zero; ``linear`` (3x1) is the direction of a prismatic joint.
     """
     if ca.SX(angular).nnz() == 0:
         return Transform(ca.SX.eye(3), linear * displacement)

@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from armcal.base.arrays import Array
 
 DIMENSIONLESS = "dimensionless"
+_Number = TypeVar("_Number", float, "Array")
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,8 @@ _DISPLAY: Mapping[str, str] = MappingProxyType({"length": "mm", "angle": "deg", 
 ERROR_UNITS: Mapping[str, str] = MappingProxyType(
     {"length": "mm", "image": "px", "force": "mN", "torque": "mNm", "angle": "mrad"}
 )
-"""What residuals may measure, and the unit of their errors: a thousandth of the one inside, in every dimension.
-
-Of several in one problem, the first that stands here is the one of its errors.
-
-That is why places in an image are held in thousands of pixels.
+"""What residuals may measure, and the unit of their errors: a thousandth of the one inside, in every dimension (so that
+places in an image are held in thousands of pixels). Of several in one problem, the first here is that of its errors.
 """
 ERROR_NAMES: Mapping[str, str] = MappingProxyType(
     {"mm": "Tip", "px": "Reprojection", "mN": "Force", "mNm": "Torque", "mrad": "Angle"}
@@ -172,10 +170,9 @@ def length_mistake(gain: float) -> tuple[str, str] | None:
 
 
 def split_suffix(name: str, dimension: str | None = None) -> tuple[str, Unit] | None:
-    """Split a name that declares its unit, ``"x_mm"`` into ``("x", mm)``.
+    """Split a name that declares its unit, ``"x_mm"`` into ``("x", mm)``; the longest unit wins.
 
-    The longest unit wins (``compliance_rad_per_Nm`` is a compliance, never a torque). None if the name ends
-    in no unit, or in one of another dimension than the one asked for.
+    None if the name ends in no unit, or in one of another dimension than the one asked for.
     """
     for unit_name in _LONGEST_FIRST:
         stem = name.removesuffix(f"_{unit_name}")
@@ -191,10 +188,7 @@ _SHORT = {"day": "d", "hour": "h", "minute": "min", "second": "s"}
 
 
 def amount_in_time(text: str) -> tuple[str, float]:
-    """What comes about in which time: ``0.05 deg in 30 d``, ``0.1 mm in a week``, ``0.02 in 1 month``.
-
-    Returns:
-        the amount as it is written, and the time (s).
+    """The amount as written, and the time (s), of ``0.05 deg in 30 d``, ``0.1 mm in a week``, ``0.02 in 1 month``.
 
     Raises:
         ValueError: it is not written so.
@@ -215,18 +209,10 @@ def amount_in_time(text: str) -> tuple[str, float]:
 
 
 def parse_quantity(text: str, dimension: str) -> float:
-    """Read a number with its unit, ``"5 mm"`` or ``"9.81 m/s^2"``.
-
-    Args:
-        text: the number, and its unit unless the dimension is dimensionless.
-        dimension: what is expected, for example ``"length"``.
-
-    Returns:
-        The value in SI units.
+    """The SI value of a number with its unit, ``"5 mm"`` or ``"9.81 m/s^2"``; without one if it is dimensionless.
 
     Raises:
-        ValueError: not a number, no unit, a unit of another dimension, or too large; lists the accepted
-            units.
+        ValueError: not a number, no unit, a unit of another dimension, or too large; lists the accepted units.
     """
     if _DECIMAL_COMMA.match(text):
         raise ValueError(_expected(f"{text!r} has a decimal comma, write a point", dimension))
@@ -256,21 +242,13 @@ def _expected(text: str, dimension: str) -> str:
     return f'{text}; expected a number and a unit of {kind}, for example "5 {display_unit(dimension).name}".'
 
 
-@overload
-def from_unit(value: float, unit_name: str) -> float: ...
-@overload
-def from_unit(value: Array, unit_name: str) -> Array: ...
-def from_unit(value: Any, unit_name: str) -> Any:
+def from_unit(value: _Number, unit_name: str) -> _Number:
     """The SI value of a number or array in the named unit; ValueError for an unknown unit."""
     known = unit(unit_name)
     return value * known.numerator / known.denominator
 
 
-@overload
-def to_unit(si_value: float, unit_name: str) -> float: ...
-@overload
-def to_unit(si_value: Array, unit_name: str) -> Array: ...
-def to_unit(si_value: Any, unit_name: str) -> Any:
+def to_unit(si_value: _Number, unit_name: str) -> _Number:
     """The value in the named unit of an SI number or array; ValueError for an unknown unit."""
     known = unit(unit_name)
     return si_value * known.denominator / known.numerator

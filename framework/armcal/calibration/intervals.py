@@ -107,7 +107,7 @@ class Uncertainty:
         if self.components:  # with the noise that the calibration estimated
             instruments = {component.name for component in self.components if component.kind == "instrument"}
             axes: Axes = "together" if instruments <= set(self.system.measurements) else "apart"
-            estimated = VarianceComponents(self.components, (), (), 0.0)
+            estimated = VarianceComponents(self.components, (), ())
             whitened = apply_components(problem, self.values, estimated, axes)
         lower = np.zeros((len(self.record.covariance),) * 2)
         for i, row in enumerate(self.record.covariance):

@@ -49,8 +49,8 @@ from armcal.config.yaml_source import Node, Origin, Reader, as_source, assignmen
 from armcal.errors import ArmcalError, ConfigError, InputError, Location, PluginError
 from armcal.io.plain_files import check_output, require_new, write_new, write_over, writing
 from armcal.measure.checks import noticed, records_of
-from armcal.measure.csv_writer import column_names, write_csv
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels
+from armcal.measure.tables import column_names, write_csv
 from armcal.plugins import PluginRegistry
 from armcal.report.document import Document
 from armcal.run.compensate import Answer, Bench, check_units, short_texts, write_commands

@@ -34,8 +34,8 @@ from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import Fit, FitRows, thinned, unbiased_roots
 from armcal.estimate.identifiability import Measure, candidates
 from armcal.measure.measurement import HasScale, Mistake, NamesMistakes
-from armcal.problem.motion import Motion, recorded_order
 from armcal.problem.problem import Problem
+from armcal.problem.variants import Motion, recorded_order
 
 Moves = Mapping[str, tuple[Array, ...]]
 """How raw residuals move with each increment of a parameter, by its name (n_r x N x k a factor)."""

@@ -35,8 +35,16 @@ from armcal.estimate.prediction import (
     quantile,
 )
 from armcal.estimate.robust import WeighedFit, Weighing, fit
-from armcal.estimate.uncertainty import automatic_block_length, standard_error_of_mean
-from armcal.estimate.validation import FitTask, JudgedFit, Recording, fit_and_judge, judged_fit, judging
+from armcal.estimate.validation import (
+    FitTask,
+    JudgedFit,
+    Recording,
+    automatic_block_length,
+    fit_and_judge,
+    judged_fit,
+    judging,
+    standard_error_of_mean,
+)
 from armcal.estimate.variance import apply_components
 from armcal.problem.problem import Problem
 

@@ -41,10 +41,9 @@ from armcal.estimate.validation import (
     measures_turns,
     record_errors,
 )
-from armcal.problem.motion import Motion, recorded_position
 from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
-from armcal.problem.variants import with_few_points
+from armcal.problem.variants import Motion, recorded_position, with_few_points
 
 T = TypeVar("T")
 MOST_RECORDS = 300  # That are looked at where more would show no more

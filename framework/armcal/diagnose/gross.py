@@ -33,7 +33,6 @@ from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure, at_random_poses
 from armcal.estimate.start import BETTER
 from armcal.estimate.validation import Halves, halves
-from armcal.problem.motion import LOADS, Motion
 from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import (
     FEWEST,
@@ -45,6 +44,7 @@ from armcal.problem.rigid_alignment import (
     tools,
     tools_of,
 )
+from armcal.problem.variants import LOADS, Motion
 
 _MM = 1000.0
 BEYOND, FAR_BEYOND, IMPLAUSIBLE = 4.0, 20.0, 100.0

@@ -37,7 +37,7 @@ from armcal.diagnose.causes import (
 from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import SMALLEST, Fit, FitRows, basis_of, lag_one, own_basis
 from armcal.estimate.identifiability import Measure, candidates
-from armcal.estimate.uncertainty import automatic_block_length
+from armcal.estimate.validation import automatic_block_length
 from armcal.measure.groups import PairedMeasurement, pose_numbers
 
 LEVEL = 0.01  # Of everything that is tried together: so often something is said of sound data

@@ -57,7 +57,6 @@ class SolverVerdict:
 
 
 def gave_up(verdict: SolverVerdict) -> NotConvergedError:
-    """The error of a fit that ended where not even its residuals can be taken."""
     return NotConvergedError(
         f"{verdict.name} did not converge ({verdict.status}): the fit was driven to where springs do not hold the arm.",
         hint=f"{CHECK_THE_DATA} If all is right, bound the compliances.",
@@ -75,12 +74,7 @@ class Solution:
 class Estimator(Protocol):
     """What a plugin provides to solve a problem on all its records at once."""
 
-    def solve(
-        self,
-        problem: Problem,
-        start: Array,
-        progress: Progress = no_progress,
-    ) -> Solution:
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
         """Minimise half the squared whitened residuals plus priors, within bounds, from ``start``.
 
         A solver that does not converge says so in its verdict; it does not raise.
@@ -110,49 +104,37 @@ class Interval95:
 
 @dataclass(frozen=True)
 class Estimated:
-    """A free number: its value, standard deviation (not a number where undetermined) and 95 % interval; SI, radians."""
+    """A free number, in SI and radians."""
 
     value: float
-    deviation: float
+    deviation: float  # standard deviation; not a number where undetermined
     interval: Interval95
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Values, and how sure they are; by name of a free number, as a mapping to ``Estimated``.
+    """Values, and how sure they are; by name of a free canonical entry, as a mapping to ``Estimated``.
 
-    Attributes:
-        parameters: the blocks, with their nominal values.
-        values: all canonical entries.
-        free_entries: positions of the free ones.
-        covariance: of the free canonical entries; directions that neither data nor priors determine are left out.
-        unconstrained: free canonical entries after a step that ignores the bounds; equals the values where no
-            bound holds.
-        square_root_information: R (n x n) with R'R the information of data and priors on the coordinates, at the
-            values; undetermined directions included, as its null space.
-        noise_scale: residuals in units of the declared noise (standard deviation).
-        degrees_of_freedom: residual numbers less what the fit takes up of them, see ``degrees_of_freedom``.
-        identifiability: what the data alone determines.
-        verdict: the solver's.
-        widened: by what the standard deviations of free entries grew because neighbouring records err alike; empty
-            where they do and nothing grew by it, None where no such correlation was found.
+    ``covariance`` leaves out directions that neither data nor priors determine. ``square_root_information`` is R
+    (n x n) with R'R the information of data and priors on the coordinates, undetermined directions as its null space.
+    ``widened`` says by what the standard deviations of free entries grew because neighbouring records err alike; it is
+    empty where they do and nothing grew by it, None where no such correlation was found.
     """
 
-    parameters: Parameters
-    values: Array
-    free_entries: tuple[int, ...]
-    covariance: Array
-    unconstrained: Array
+    parameters: Parameters  # the blocks, with their nominal values
+    values: Array  # all canonical entries
+    free_entries: tuple[int, ...]  # positions of the free ones
+    covariance: Array  # of the free canonical entries
+    unconstrained: Array  # free canonical entries after a step that ignores the bounds
     square_root_information: Array
-    noise_scale: float
-    degrees_of_freedom: float
-    identifiability: Identifiability
+    noise_scale: float  # residuals in units of the declared noise (standard deviation)
+    degrees_of_freedom: float  # residual numbers less what the fit takes up of them
+    identifiability: Identifiability  # what the data alone determines
     verdict: SolverVerdict
     widened: tuple[float, ...] | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the free canonical entries."""
         return tuple(self.parameters.entry_names[i] for i in self.free_entries)
 
     def __getitem__(self, name: str) -> Estimated:
@@ -167,9 +149,6 @@ class Estimate:
 
     def __len__(self) -> int:
         return len(self.names)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._places
 
     def keys(self) -> KeysView[str]:
         """Names of the free canonical entries."""
@@ -259,12 +238,6 @@ class Influence:
     slope: float  # mean derivative of that by the residual
     noise_scale: float  # residuals in units of the declared noise, outliers discounted
 
-    @classmethod
-    def of_least_squares(cls, cost: float, freedom: float) -> Influence:
-        """All alike; with less than one degree of freedom the declared noise is believed."""
-        noise_scale = float(np.sqrt(2 * cost / freedom)) if freedom >= 1 else 1.0
-        return cls(None, noise_scale, 1.0, noise_scale)
-
 
 def estimate(problem: Problem, solution: Solution, influence: Influence | None = None) -> Estimate:
     """Covariance, intervals and identifiability at a solution; without ``influence``, one of least squares.
@@ -288,7 +261,9 @@ def estimate(problem: Problem, solution: Solution, influence: Influence | None =
     known = identify_from(triangle, parameters)
     inverse = InverseInformation.of(np.sqrt(slope) * triangle, parameters)
     half, freedom = inverse.root, problem.equations() - inverse.spent
-    influence = influence or Influence.of_least_squares(equations.cost, freedom)
+    if influence is None:  # with less than one degree of freedom the declared noise is believed
+        noise_scale = float(np.sqrt(2 * equations.cost / freedom)) if freedom >= 1 else 1.0
+        influence = Influence(None, noise_scale, 1.0, noise_scale)
     by_data = influence.spread * half @ (half.T @ triangle.T)
     by_both = np.hstack([by_data, half @ (half.T * np.sqrt(prior))])
     pull = equations.gradient + prior * parameters.coordinates(parameters.local(solution.values))

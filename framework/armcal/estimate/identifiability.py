@@ -60,8 +60,6 @@ class Measure:
 
 @dataclass(frozen=True)
 class Combination:
-    """A direction in parameter space."""
-
     terms: tuple[tuple[str, float], ...]  # (name, coefficient in typical scales of the parameter), the largest first
     measures: tuple[Measure, ...] = ()  # one a term; empty to show coefficients in typical scales
 
@@ -116,18 +114,11 @@ _MOST_WIDE = 300
 
 
 def sparse_basis(space: Array, nested: tuple[Array, ...] = (), within: float = EXACT) -> Array:
-    """A basis (m x n) of the same space whose vectors have few entries.
+    """A basis (m x n) of the space of orthonormal rows (m x n) whose vectors have few entries, the largest of each 1.
 
     Vectors of up to three entries are all tried; beyond them those of the least sum of magnitudes are searched for.
-
-    Args:
-        space: orthonormal rows (m x n).
-        nested: orthonormal rows of subspaces of it, each in the next, known to ``within``; the basis begins with a
-            basis of the first, goes on to one of the second, and so on.
-        within: sine of the angle.
-
-    Returns:
-        rows with a largest entry of 1.
+    ``nested`` are orthonormal rows of subspaces of it, each in the next, known to ``within`` (sine of the angle); the
+    basis begins with a basis of the first, goes on to one of the second, and so on.
     """
     chosen = np.zeros((0, space.shape[1]))
     for part in (*nested, space):
@@ -345,9 +336,8 @@ def analyse(
 class InverseInformation:
     """The inverse of the information of data and priors, R'R + P, by coordinates (SI).
 
-    Attributes:
-        spent: how many of the data's numbers the fit takes up, tr J B B' J', the trace of its hat matrix: one for a
-            direction that the data alone determines, none for one that its prior alone holds [Hastie2009].
+    ``spent`` is how many of the data's numbers the fit takes up, tr J B B' J', the trace of its hat matrix: one for a
+    direction that the data alone determines, none for one that its prior alone holds [Hastie2009].
     """
 
     root: Array  # B (n x k) with B B' the inverse, in the k directions that data and priors determine together
@@ -436,31 +426,17 @@ _NEW = 1e-6  # Of a column's own length: less than this beyond what is kept adds
 
 @dataclass(frozen=True)
 class Dropped:
-    """A coordinate that need not be free.
-
-    Attributes:
-        absorbed_by: it first, then what the kept ones do instead: the combination that changes no measurement.
-    """
-
-    name: str  # of the coordinate
-    absorbed_by: Combination
+    name: str  # of a coordinate that need not be free
+    absorbed_by: Combination  # it first, then what the kept ones do instead: changes no measurement
     left: float  # the part of its effect that the kept ones cannot imitate, 0 to 1
 
 
 @dataclass(frozen=True)
 class MinimalSet:
-    """Which blocks to free.
-
-    Attributes:
-        left_out: coordinates that would add something, but were not wanted (too many, or too uncertain).
-        deviations: of the kept coordinates, in typical scales, by the declared noise; infinite where a kept block
-            has an undetermined combination within it.
-    """
-
-    kept: tuple[str, ...]  # block names, in the order of the parameters
+    kept: tuple[str, ...]  # names of blocks to free, in the order of the parameters
     redundant: tuple[Dropped, ...]  # coordinates that the kept ones absorb entirely
-    left_out: tuple[Dropped, ...]
-    deviations: dict[str, float]
+    left_out: tuple[Dropped, ...]  # coordinates that would add something, but were too many, or too uncertain
+    deviations: dict[str, float]  # of kept coordinates, in typical scales, by the declared noise; inf: undetermined
 
 
 def minimal_set(
@@ -584,8 +560,6 @@ MOST_LISTED = 5  # So many undetermined combinations are listed in one message
 
 @dataclass(frozen=True)
 class Undetermined:
-    """A combination that the records do not determine, and why."""
-
     combination: Combination
     cause: Cause
 
@@ -694,8 +668,7 @@ def scale_is_unseen(problem: Problem, values: Array, known: Identifiability) -> 
 def require_solvable(problem: Problem, start: Array) -> tuple[str, ...]:
     """Refuse a problem whose answer would be invented.
 
-    Returns:
-        warnings: what is left to priors because the records are too few, or see no scale.
+    Gives warnings of what is left to priors because the records are too few, or see no scale.
     """
     parameters = problem.parameters
     count = problem.equations()
@@ -746,9 +719,7 @@ _SINGULAR = 1e-11
 
 @dataclass(frozen=True)
 class Candidate:
-    """A fixed parameter that the records would determine."""
-
-    name: str  # of its block
+    name: str  # of the block of a fixed parameter that the records would determine
     sd: Array  # of its coordinates if it were free, by the residuals found (SI)
     change: Array  # by how much it would move, to first order (SI)
     p_value: float  # that it gains nothing, counting that so many were looked at

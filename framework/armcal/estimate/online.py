@@ -46,9 +46,7 @@ class Observation(Protocol):
 
 @dataclass(frozen=True)
 class Update:
-    """A belief after a record."""
-
-    posterior: Gaussian  # the belief
+    posterior: Gaussian  # the belief after a record
     innovation: Array  # measured minus predicted by the prior, linearised where the update ended (m)
     covariance: Array  # of that innovation, as expected (m x m)
 
@@ -97,11 +95,7 @@ def log_density(nis: float, log_determinant: float, count: int, freedom: float =
 
 
 def checked(belief: Gaussian) -> Gaussian:
-    """The belief with an exactly symmetric covariance.
-
-    Raises:
-        ProblemError: a variance is not positive, or a number is not finite.
-    """
+    """The belief with an exactly symmetric covariance; a ProblemError if its numbers are not sound."""
     covariance = belief.covariance + belief.covariance.T
     covariance *= 0.5
     lowest = float(covariance.diagonal().min(initial=np.inf))

@@ -116,8 +116,8 @@ def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | 
 def hopeless(problem: Problem, dataset: Dataset, start: Array, named: bool = False) -> Solution | None:
     """The start, if a short search over some of the records says that no search leads on from there; else None.
 
-    Asked of measurements of positions in the base frame alone; ``records`` are those of the dataset, which train. Where
-    no other reading was ``named`` that explains them, the status says so.
+    Asked of measurements of positions in the base frame alone. Where no other reading was ``named`` that explains them,
+    the status says so.
     """
     began = time.perf_counter()
     chosen = np.arange(0, len(dataset), max(1, -(-len(dataset) // _MOST_RECORDS)))
@@ -235,10 +235,6 @@ def settled(problem: Problem, values: Array) -> Array:
     """Values with the groups that a fit did not see fitted to their own records, and all else held.
 
     A socket that only records touch which judge has to be found from them: what is left is how far they disagree.
-
-    Args:
-        problem: as it was fitted; the groups it holds although they were compiled as free are those not seen.
-        values: of the fit.
     """
     unseen = of_unseen_groups(problem, values)
     if unseen is None:

@@ -90,7 +90,6 @@ class KnownDrift:
 
     @classmethod
     def by(cls, problem: Problem, values: Array) -> KnownDrift | None:
-        """From the records of a fit at the values found; None where nothing drifts."""
         shared = problem.correlation
         if shared is None:
             return None
@@ -110,8 +109,6 @@ class NewRecording:
 
 @dataclass(frozen=True)
 class Predictor:
-    """A fit as far as its predictions need it."""
-
     values: Array  # found (all canonical entries)
     covariance: Array  # of the free canonical entries
     noise_scale: float  # residuals in units of the declared noise
@@ -212,8 +209,8 @@ def is_position(kernel: Kernel) -> bool:
 def _without_itself(noise: Array, known: Array, factor_records: FactorRecords) -> Array:
     """Covariance of each record's residual (N x n_r x n_r) had the fit not had the record.
 
-    ``known`` is that of what the fit predicts, which the record helped to know: of information it added its weight
-    times the inverse of its noise, and that is taken away again.
+    ``known`` is that of what the fit predicts; of its information the record's own, its weight times the inverse of its
+    noise, is taken away again.
     """
     root = np.linalg.cholesky(noise)
     inverse = np.linalg.inv(root)
@@ -228,12 +225,9 @@ def _degrees_of_freedom(
 ) -> tuple[float, float]:
     """Of the mean square of all rows, as records are correlated and if they were independent.
 
-    Those of the chi-square with its mean and variance, tr(C)^2 / tr(C^2) [Satterthwaite1946].
-
-    Args:
-        noises: covariance of each measurement's rows that no other record shares (N x n_r x n_r).
-        roots: the same rows by the drifts (N x n_r x n_s).
-        kernels: correlation of each drift between the records (N x N).
+    Those of the chi-square with its mean and variance, tr(C)^2 / tr(C^2) [Satterthwaite1946]. ``noises`` are
+    covariances of each measurement's rows that no other record shares (N x n_r x n_r), ``roots`` the same rows by the
+    drifts (N x n_r x n_s), ``kernels`` the correlation of each drift between the records (N x N).
     """
     across = np.sum([np.einsum("nrs,nrt->nst", own, own) for own in roots], axis=0)
     trace = sum(float(np.einsum("nrr->", noise)) for noise in noises) + float(np.einsum("nss->", across))
@@ -258,30 +252,18 @@ _WEIGHTS = np.geomspace(1.0, 1e5, 51)  # Of the declared noise, in records: thos
 
 @dataclass(frozen=True)
 class ResidualSpread:
-    """Of one measurement.
-
-    Attributes:
-        channel: what counts it: ``sequence`` where the records say their place, else ``record``, one by one.
-    """
-
-    covariance: Array  # of the raw residual (n_r x n_r; m or rad)
+    covariance: Array  # of the raw residual of one measurement (n_r x n_r; m or rad)
     share: float  # of it that neighbours have in common, 0 to 1
     over: float  # distance over which the common part falls by e
-    channel: str = "record"
+    channel: str = "record"  # what counts that: ``sequence`` where the records say their place, else one by one
     freedom: float = math.inf  # degrees of freedom with which the covariance is known
 
 
 def residual_spread(problem: Problem, estimate: Estimate, dataset: Dataset) -> dict[str, ResidualSpread]:
-    """The scatter of the residuals that an estimate leaves, by measurement.
+    """The scatter of the residuals that an estimate of a problem leaves, by measurement.
 
     Where parameters drift, what neighbours share is the drift: what is left is the declared noise, scaled to the
-    residuals.
-
-    Args:
-        problem: that was solved.
-        estimate: of it.
-        records: it was trained on, with their weights.
-        dataset: the same ones, in the order of recording or with their ``sequence``.
+    residuals. ``dataset`` has the records in the order of recording or with their ``sequence``.
     """
     known = max(float(estimate.degrees_of_freedom), 1.0)
     if problem.correlation is not None:
@@ -311,11 +293,9 @@ def residual_spread(problem: Problem, estimate: Estimate, dataset: Dataset) -> d
 def _shrunk(products: Array, count: float, noise: Array, scale: float) -> tuple[Array, float]:
     """The covariance of residuals (n_r x n_r), and the records that it is worth, those of the declared noise included.
 
-    Args:
-        products: sum of the residuals' outer products (n_r x n_r; m or rad).
-        count: how many records they are worth, less what parameters took of them.
-        noise: standard deviations that are declared (n_r; m or rad).
-        scale: of all residuals against theirs; holds where this measurement's own are too few to say.
+    ``products`` is the sum of the residuals' outer products, ``count`` how many records they are worth less what
+    parameters took of them, ``noise`` the declared standard deviations; ``scale``, of all residuals against theirs,
+    holds where this measurement's own are too few to say.
     """
     rows, own = len(noise), float(np.sum(np.diag(products) / noise**2))
     variance = own / (rows * count) if rows * count >= 1 else scale**2

@@ -4,18 +4,14 @@ Both solve weighted least squares again and again, each time from the last answe
 its bounds and its priors. The loss of record i is s^2 rho(u_i / s): u_i is the norm of its whitened residual, s
 its instrument's scale. Small residuals cost what they cost in least squares, and priors weigh as they were stated.
 
-How far each record lies from a fit, in units of what its own residual should scatter by.
-
 A record that pulls the fit towards itself has a small residual even if it is wrong. With H = J C J' (C the inverse
 of the information of records and priors, J whitened) and w the record's weight in the fit, the covariance of its
 residual is s^2 (I - (2 w - 1) H): I - H for one that took part, I + H for one that was set aside [Rousseeuw1987].
 
-Robust losses of a record's residual as a whole, so that no choice of axes matters.
-
-With t the norm of a record's m whitened residuals in units of their scale, the loss is rho(t) and its weight
-rho'(t)/t [Huber1981]. A tuning constant is the one with which, if all noise were Gaussian after all, the estimate
-of a location in m dimensions would keep 95 % of the efficiency of least squares; for m = 1 these are the
-customary 1.345 (Huber) and 2.385 (Cauchy) [Holland1977].
+A loss is of a record's residual as a whole, so that no choice of axes matters. With t the norm of a record's m whitened
+residuals in units of their scale, it is rho(t) and its weight rho'(t)/t [Huber1981]. A tuning constant is the one with
+which, if all noise were Gaussian after all, the estimate of a location in m dimensions would keep 95 % of the
+efficiency of least squares; for m = 1 these are the customary 1.345 (Huber) and 2.385 (Cauchy) [Holland1977].
 """
 
 from __future__ import annotations
@@ -58,18 +54,9 @@ _LARGEST_NORM, _STEPS = 12.0, 20000
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss with its tuning constant, for residuals of one dimension."""
-
     name: LossName  # which one
     constant: float  # beyond this many scales a record weighs less (Huber), or half or less (Cauchy)
     dimension: int  # m, how many residual numbers a record has
-
-    def rho(self, norms: Array) -> Array:
-        """The loss; t^2/2 for small norms t."""
-        c = self.constant
-        if self.name == "huber":
-            return np.where(norms <= c, norms**2 / 2, c * norms - c**2 / 2)
-        return np.asarray(c**2 / 2 * np.log1p((norms / c) ** 2))
 
     def weight(self, norms: Array) -> Array:
         """rho'(t)/t, from 1 down."""
@@ -125,18 +112,12 @@ UNCONTROLLED = 1e-3  # Of a residual's variance: below this it would hardly show
 
 @dataclass(frozen=True)
 class Distances:
-    """Of all records, factor by factor.
+    """Of all records, factor by factor."""
 
-    Attributes:
-        studentised: length of each residual in its own standard deviations (N each); 0 where nothing controls it.
-        scales: residuals in units of their noise, by their median, so that a minority of outliers hardly matters.
-        leverages: variance of what the fit predicts of each record, in units of its noise (N each).
-    """
-
-    studentised: tuple[Array, ...]
+    studentised: tuple[Array, ...]  # lengths of residuals in their own deviations (N each); 0 where nothing controls it
     limits: tuple[float, ...]  # the length that the largest of all stays below in 99 % of experiments without outliers
-    scales: tuple[float, ...]
-    leverages: tuple[Array, ...]
+    scales: tuple[float, ...]  # residuals in units of their noise, by their median: few outliers hardly matter
+    leverages: tuple[Array, ...]  # variance of what the fit predicts of each record, in units of its noise (N each)
 
     def beyond(self) -> tuple[Array, ...]:
         """How many limits away each record lies (N each)."""
@@ -227,22 +208,13 @@ Weights = tuple[Array, ...]
 
 
 @dataclass(frozen=True)
-class Round:
-    """One solve: what was done before it, the robust cost (scales as of then), the largest change of a weight."""
-
-    what: Literal["scale", "weights", "selection"]
-    cost: float
-    moved: float
-
-
-@dataclass(frozen=True)
 class RobustFit:
     """Where reweighting or selecting came to rest."""
 
     solution: Solution  # the solver's, with all rounds counted; converged only if the weights settled too
     weights: Weights  # of each record, factor by factor (N each), from 0 to 1
     scales: tuple[float, ...]  # residuals in units of their noise, one a factor
-    rounds: tuple[Round, ...]  # in order
+    rounds: int  # how many solves weights were found from
     warnings: tuple[str, ...] = ()  # what a user should know
 
 
@@ -276,23 +248,8 @@ def scales_of(problem: Problem, lengths: Weights, freedom: float) -> tuple[float
     return tuple(scales)
 
 
-def robust_cost(
-    problem: Problem, values: Array, lengths: Weights, scales: Sequence[float], kinds: Sequence[Loss]
-) -> float:
-    """What a robust fit minimises: losses and priors (a drift's own cost left out)."""
-    moved = problem.parameters.coordinates(problem.parameters.local(values))
-    total = 0.5 * float(problem.parameters.prior_information() @ moved**2)
-    for length, scale, loss in zip(lengths, scales, kinds, strict=True):
-        total += scale**2 * float(np.sum(loss.rho(length / scale)))
-    return total
-
-
 def reweighted(
-    problem: Problem,
-    estimator: Estimator,
-    first: Solution,
-    name: LossName,
-    progress: Progress = no_progress,
+    problem: Problem, estimator: Estimator, first: Solution, name: LossName, progress: Progress = no_progress
 ) -> RobustFit:
     """Iteratively reweighted least squares [Holland1977] from a solution.
 
@@ -300,10 +257,10 @@ def reweighted(
     raises the robust cost, since the weighted squares touch the loss from above.
     """
     kinds, weights, scales = losses(problem, name), ones(problem), (np.inf,) * len(problem.records)
-    solution, rounds, settling, freedom = first, list[Round](), True, 0.0
+    solution, moved, settling, freedom = first, 0.0, True, 0.0
     for number in range(MOST_ROUNDS):
         if not solution.verdict.converged:
-            return RobustFit(solution, weights, scales, tuple(rounds))
+            return RobustFit(solution, weights, scales, number)
         lengths = norms(problem, solution.values, weights)
         if not number:
             freedom = degrees_of_freedom(problem, solution.values)
@@ -312,25 +269,18 @@ def reweighted(
             settling = number < MOST_SCALE_ROUNDS and not np.allclose(scales, before, rtol=SCALE_SETTLED, atol=0)
         following = tuple(loss.weight(u / s) for loss, u, s in zip(kinds, lengths, scales, strict=True))
         moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(weights, following, strict=True))
-        cost = robust_cost(problem, solution.values, lengths, scales, kinds)
-        rounds.append(Round("scale" if settling else "weights", cost, moved))
         if not settling and moved <= WEIGHTS_SETTLED:
-            return RobustFit(
-                _with_status(solution, f"{name} settled after {number} rounds"), weights, scales, tuple(rounds)
-            )
+            settled = _with_status(solution, f"{name} settled after {number} rounds")
+            return RobustFit(settled, weights, scales, number + 1)
         weights = following
         progress(f"{name} loss", number / MOST_ROUNDS)
         solution = _continued(solution, problem.weighted(weights), estimator)
-    text = f"{name}: weights still moved by {rounds[-1].moved:.1e} after {MOST_ROUNDS} rounds"
-    return RobustFit(_with_status(solution, text, converged=False), weights, scales, tuple(rounds))
+    text = f"{name}: weights still moved by {moved:.1e} after {MOST_ROUNDS} rounds"
+    return RobustFit(_with_status(solution, text, converged=False), weights, scales, MOST_ROUNDS)
 
 
 def selected(
-    problem: Problem,
-    estimator: Estimator,
-    first: RobustFit,
-    most: float,
-    progress: Progress = no_progress,
+    problem: Problem, estimator: Estimator, first: RobustFit, most: float, progress: Progress = no_progress
 ) -> RobustFit:
     """Set aside what lies beyond the limit of ``studentised_distances``, fit the rest, until nothing changes.
 
@@ -352,11 +302,8 @@ def selected(
             return _noted(fit, "selection goes round in circles", warning)
         seen.append(key)
         progress("reject", number / MOST_SELECTIONS)
-        kept = problem.weighted(following)
-        moved = max(float(np.abs(a - b).max(initial=0.0)) for a, b in zip(fit.weights, following, strict=True))
-        solution = _continued(fit.solution, kept, estimator)
-        rounds = (*fit.rounds, Round("selection", kept.cost(solution.values), moved))
-        fit = replace(fit, solution=solution, weights=following, rounds=rounds)
+        solution = _continued(fit.solution, problem.weighted(following), estimator)
+        fit = replace(fit, solution=solution, weights=following, rounds=fit.rounds + 1)
         if warning:
             return _noted(fit, "selection ended at the most that may be set aside", warning)
     text = f"selection did not settle in {MOST_SELECTIONS} rounds"
@@ -470,11 +417,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class WeighedFit:
-    """A fit, and how its records weighed.
-
-    Attributes:
-        as_declared: values of the fit by the declared noise, which came before variances were estimated; else None.
-    """
+    """A fit, and how its records weighed."""
 
     solution: Solution  # the solver's
     estimate: Estimate  # values and how sure they are
@@ -483,9 +426,9 @@ class WeighedFit:
     suspects: tuple[Suspect, ...] = ()  # the farthest first; empty without a loss
     components: VarianceComponents | None = None  # estimated variances, or None
     loss: str = "none"  # which one; ``none`` for least squares
-    rounds: tuple[Round, ...] = ()  # of reweighting and selecting
+    rounds: int = 0  # of reweighting and selecting
     warnings: tuple[str, ...] = ()  # what a user should know
-    as_declared: Array | None = None
+    as_declared: Array | None = None  # values by the declared noise, before variances were estimated; else None
 
     @property
     def set_aside(self) -> tuple[Suspect, ...]:
@@ -507,16 +450,10 @@ class Weighing:
     def spread(self, executor: Executor) -> Weighing:
         return Weighing(spread(self.inner, executor), self.settings)
 
-    def solve(
-        self,
-        problem: Problem,
-        start: Array,
-        progress: Progress = no_progress,
-    ) -> Solution:
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
         return self._weighed(problem, self._declared(problem, start, progress), progress)[0].solution
 
     def fit(self, problem: Problem, start: Array, progress: Progress = no_progress) -> WeighedFit:
-        """Values, and everything that is known of how records weighed."""
         declared = self._declared(problem, start, progress)
         robust, whitened, components = self._weighed(problem, declared, progress)
         loss, acting, suspects = self.settings.loss, None, list[Suspect]()
@@ -574,7 +511,7 @@ class Weighing:
     def _robust(self, problem: Problem, first: Solution, progress: Progress) -> RobustFit:
         loss = self.settings.loss
         if loss == "none" or not first.verdict.converged or not problem.increments:
-            return RobustFit(first, ones(problem), (1.0,) * len(problem.records), ())
+            return RobustFit(first, ones(problem), (1.0,) * len(problem.records), 0)
         huber = reweighted(problem, self.inner, first, "huber", progress)
         if loss == "huber" or not huber.solution.verdict.converged:
             return huber
@@ -594,12 +531,7 @@ def weighed(estimator: Estimator, settings: NoiseSettings) -> Estimator:
     return estimator if settings.loss == "none" and not settings.estimate else Weighing(estimator, settings)
 
 
-def fit(
-    problem: Problem,
-    estimator: Estimator,
-    start: Array,
-    progress: Progress = no_progress,
-) -> WeighedFit:
+def fit(problem: Problem, estimator: Estimator, start: Array, progress: Progress = no_progress) -> WeighedFit:
     if isinstance(estimator, Weighing):
         return estimator.fit(problem, start, progress)
     return plain_fit(problem, estimator.solve(problem, start, progress))

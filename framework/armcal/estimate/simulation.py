@@ -67,12 +67,8 @@ def measured_with_noise(
 ) -> dict[str, Array]:
     """Readings by channel (N each; SI) whose residuals have Gaussian noise as their measurements declare it.
 
-    Args:
-        request: arms and measurements, with the truth for nominal values.
-        commands: joint angles, approaches, load and gravity.
-        exact: what every instrument would read without noise, by channel.
-        random: where noise comes from.
-        length_noise: of all residuals that are lengths, in place of the declared one (m).
+    ``request`` has the truth for nominal values, ``exact`` what every instrument would read without noise, by channel;
+    ``length_noise`` (m) is that of all residuals that are lengths, in place of the declared one.
     """
     fixed, read = request.parameters.with_free(()), with_channels(commands, exact)
     parts = (request.arms, request.measurements, fixed, request.environment, read)
@@ -135,7 +131,6 @@ def with_outliers(
 
 
 def at_truth(request: SimulationRequest, truth: Path) -> SimulationRequest:
-    """The request at the parameter values of a file."""
     source = load_config(truth)
     return replace(request, parameters=with_values(request.parameters, source.data, source, ()))
 

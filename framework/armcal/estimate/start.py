@@ -61,17 +61,13 @@ class _Motion:
 
 @dataclass(frozen=True)
 class Placing:
-    """Free parameters that move the arm as a whole, or the target on its tool.
-
-    Attributes:
-        shifts: of each number that only shifts the target, its name and the direction (3, by its increment).
-    """
+    """Free parameters that move the arm as a whole, or the target on its tool."""
 
     base: tuple[str, ...]  # names of those that move the arm
     target: tuple[str, ...]  # names of those that move the target
     basis: Array  # orthonormal directions in the tool's axes along which these move it (3 x k)
     rank: int  # how many of the six motions the base can make
-    shifts: tuple[tuple[str, Array], ...] = ()
+    shifts: tuple[tuple[str, Array], ...] = ()  # numbers that only shift the target, with the direction (3)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -218,21 +214,14 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit starts.
-
-    Attributes:
-        vectors: values at which they were found, the best first; other parameters are not theirs to say. Those with a
-            prior keep their nominal value in ``problem``, and start where they were found.
-        tools: of the nominal arm as configured, in the records looked at.
-        configured, left: typical distance (m) of the arm from the positions, before and after.
-    """
+    """Where a fit starts; parameters with a prior keep their nominal value in ``problem``, and start in ``vectors``."""
 
     problem: Problem  # its nominal values are where base and target were found, where the configuration's are far off
     names: tuple[str, ...] = ()  # of the parameters that place the arm and the target
-    vectors: tuple[Array, ...] = ()
+    vectors: tuple[Array, ...] = ()  # values at which they were found, the best first; of no other parameters
     alignment: Alignment | None = None  # of the nominal arm; None where there is none
-    configured: float = 0.0
-    left: float = 0.0
+    configured: float = 0.0  # typical distance (m) of the arm from the positions
+    left: float = 0.0  # the same from where they were found
     taken: bool = False  # whether the start is elsewhere than the configuration has it
     gauges: tuple[str, ...] = ()  # what the positions do not determine of base and target, in words
     warnings: tuple[str, ...] = ()  # for the user
@@ -274,20 +263,16 @@ def aligned_start(problem: Problem, dataset: Dataset) -> Start:
         return as_configured
 
 
-def _chosen(
-    problem: Problem,
-    sighting: Sighting,
-    tools: Tools,
-    placing: Placing,
-    ranked: Sequence[Alignment],
-) -> Start:
+def _chosen(problem: Problem, sighting: Sighting, tools: Tools, placing: Placing, ranked: Sequence[Alignment]) -> Start:
     """The best alignment that the free parameters reach, if it is much better than the configuration."""
     configured, some = sighting.off(tools), problem.subset(sighting.chosen)
     gauges = undetermined(tools, ranked[0], placing.basis)
     start = Start(problem, placing.names, (), ranked[0], configured, configured, False, gauges)
     if configured <= FAR * sighting.size:
         return start
-    reached = [placing.reached(problem, sighting, shown_by(a, tools, sighting)) for a in ranked]
+    mounted = np.eye(3) if sighting.turned is None else hand_eye(tools.rotations, sighting.turned)[1]
+    shown = [Tools(a.moved(tools), a.turn @ tools.rotations @ mounted) for a in ranked]
+    reached = [placing.reached(problem, sighting, tools_shown) for tools_shown in shown]
     left = [sighting.off(tools_of(some, values, sighting.kernel)) for values in reached]
     order = np.argsort(left)
     best, start = reached[order[0]], replace(start, vectors=tuple(reached[i] for i in order))
@@ -300,13 +285,6 @@ def _chosen(
     for name in (name for name in placing.names if parameters[name].prior_sd is None):
         nominal[parameters.entries_of(name)] = best[parameters.entries_of(name)]
     return replace(start, problem=problem.with_parameters(parameters.with_nominal(nominal)), left=min(left), taken=True)
-
-
-def shown_by(alignment: Alignment, tools: Tools, sighting: Sighting) -> Tools:
-    turned = alignment.turn @ tools.rotations
-    if sighting.turned is not None:
-        turned = turned @ hand_eye(tools.rotations, sighting.turned)[1]
-    return Tools(alignment.moved(tools), turned)
 
 
 def _disagreement(problem: Problem, values: Array, configured: float, left: float) -> str:

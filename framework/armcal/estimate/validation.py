@@ -1,20 +1,29 @@
-"""Validation: which records train, which judge, and how wrong the model is on each."""
+"""Validation: which records train, which judge, and how wrong the model is on each; intervals by resampling.
+
+The bootstrap draws records with replacement [Efron1993], in circular blocks of neighbours whose errors resemble one
+another [Politis1992]; blocks of one record draw independent ones. What is wrong with the model stays in the records, so
+that the spread counts it.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import wraps
-from typing import Any, Concatenate, Literal, ParamSpec
+from functools import partial, wraps
+from typing import Annotated, Any, Concatenate, Literal, ParamSpec
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from pydantic import Field
 
 from armcal.base.arrays import Array, Indices
+from armcal.base.settings import Settings
 from armcal.base.units import ERROR_NAMES, ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
-from armcal.estimate.estimator import Estimator, Progress, Solution, gave_up, no_progress
+from armcal.estimate.estimator import CONFIDENCE, Estimate, Estimator, Progress, Solution, gave_up, no_progress
 from armcal.estimate.polish import restricted, settled
 from armcal.io.parallel import Executor
 from armcal.measure.measurement import Placed
@@ -42,8 +51,6 @@ class ErrorSummary:
 
 @dataclass(frozen=True)
 class Split:
-    """Which records train and which judge."""
-
     train: Indices
     holdout: Indices
 
@@ -154,7 +161,6 @@ def _poses(count: int, poses: Indices | None) -> tuple[Indices, int]:
 
 
 def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
-    """Records with these ids train, the others judge."""
     training = set(train_ids)
     missing = sorted(training - set(ids))
     if missing:
@@ -167,7 +173,6 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
 
 
 def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
-    """Records with one of these labels train, the others judge."""
     missing = sorted(set(train) - set(labels))
     if missing:
         raise ProblemError(
@@ -179,7 +184,7 @@ def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
 
 
 def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> tuple[Split, ...]:
-    """Random folds of nearly equal size; every record judges once. Records of one pose (numbers, N) stay together."""
+    """Random folds of nearly equal size; records of one pose (numbers, N) stay together."""
     poses, different = _poses(count, poses)
     if not 2 <= number <= different:
         raise ProblemError(
@@ -210,11 +215,8 @@ class FitTask:
 class JudgedFit:
     """How a fit on the records that train does on those that judge; errors are nan if it did not converge.
 
-    Attributes:
-        held_residuals: raw residuals of the records that judge, by recording (``new`` only where something drifts);
-            none where no predictions were asked for.
-        unknown: covariance of these by what a pose residual did not know (N x n_r x n_r each); None without one.
-        without: the errors ``at_rest`` without the pose residual that the fit learned; None where it learns none.
+    ``held_residuals`` are raw, of the records that judge, by recording (``new`` only where something drifts); none
+    where no predictions were asked for.
     """
 
     errors: Array  # m
@@ -223,25 +225,21 @@ class JudgedFit:
     converged: bool = True  # whether the fit did
     seconds: float = 0.0  # that it took
     held_residuals: Mapping[Recording, tuple[Array, ...]] = field(default_factory=dict)
-    unknown: tuple[Array, ...] | None = None
-    without: Array | None = None
+    unknown: tuple[Array, ...] | None = None  # covariance by what a pose residual did not know (N x n_r x n_r each)
+    without: Array | None = None  # errors at rest without the pose residual that the fit learned
     values: Array | None = None  # of the fit; None if it did not converge
     gains: Array | None = None  # by how much that makes errors of each measurement smaller at rest (measurements x N)
 
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge).
-
-    ``at_rest`` are the errors if nothing is known of a drift, ``turns`` those of orientations (rad), where measured;
-    ``fits`` those of the folds, in order.
-    """
+    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge)."""
 
     errors: Array
-    at_rest: Array
-    turns: Array | None
+    at_rest: Array  # if nothing is known of a drift
+    turns: Array | None  # of orientations (rad), where measured
     failed_folds: int
-    fits: tuple[JudgedFit, ...] = ()
+    fits: tuple[JudgedFit, ...] = ()  # of the folds, in order
 
 
 def judging(judge: Callable[Concatenate[FitTask, P], JudgedFit]) -> Callable[Concatenate[FitTask, P], JudgedFit]:
@@ -294,13 +292,9 @@ def cross_validate(
 
 @dataclass(frozen=True)
 class Halves:
-    """What fits to either half of the records say, of several divisions; nan where one did not converge.
+    """What fits to either half of the records say, of several divisions; nan where one did not converge."""
 
-    Attributes:
-        apart: how far the pose of each measurement that is ``Placed`` differs between the two (mm, deg; K x 2).
-    """
-
-    apart: Mapping[str, Array]
+    apart: Mapping[str, Array]  # by how much the poses of measurements that are ``Placed`` differ (mm, deg; K x 2)
     errors: Array  # of records by the fit to the other half, on average (K; thousandths, as errors are shown)
 
 
@@ -329,3 +323,142 @@ def pose_size(coordinates: Mapping[str, float], pose: str) -> tuple[float, float
     place = [coordinates.get(f"{pose}_{axis}", np.nan) for axis in "xyz"]
     turn = [coordinates.get(f"{pose}_rotation<r{axis}>", np.nan) for axis in "xyz"]
     return 1000 * float(np.linalg.norm(place)), float(np.degrees(np.linalg.norm(turn)))
+
+
+BlockLength = int | Literal["auto"]
+_SIGNIFICANT = 2.0
+_FEW = 8  # Series shorter than this do not determine their own correlation
+
+
+def automatic_block_length(series: Array) -> int:
+    """The block length for a series (..., N), the longest of its rows'. [Politis2004] [Patton2009]
+
+    Autocovariances count up to twice the lag behind which they are noise, by a flat-top window.
+    """
+    rows = np.atleast_2d(series)
+    return max((_row_length(row[np.isfinite(row)]) for row in rows), default=1)
+
+
+def _row_length(row: Array) -> int:
+    count = len(row)
+    centred = row - row.mean() if count else row
+    if count < _FEW or not np.any(np.abs(centred) > 0):
+        return 1
+    window = max(5, math.ceil(math.sqrt(math.log10(count))))
+    most_lag = min(math.ceil(math.sqrt(count)) + window, count - 1)
+    covariance = np.array([centred[lag:] @ centred[: count - lag] / count for lag in range(most_lag + 1)])
+    # The lag behind which a window of them is no larger than chance; the last larger one if there is none.
+    large = np.abs(covariance[1:] / covariance[0]) >= _SIGNIFICANT * math.sqrt(math.log10(count) / count)
+    quiet = np.flatnonzero(~sliding_window_view(large, window).any(axis=1))
+    last = int(quiet[0]) if len(quiet) else int(np.flatnonzero(large).max(initial=0)) + 1
+    reach = min(2 * max(last, 1), most_lag)
+    lags = np.arange(1, reach + 1)
+    flat_top = np.minimum(1.0, 2 * (1 - lags / reach))
+    weighted = flat_top * covariance[1 : reach + 1]
+    spectrum = covariance[0] + 2 * weighted.sum()
+    slope = 2 * (lags @ weighted)
+    if spectrum <= 0:
+        return 1
+    length = (1.5 * (slope / spectrum) ** 2 * count) ** (1 / 3)
+    most = min(3 * math.sqrt(count), count / 3)
+    return int(np.clip(round(length), 1, max(1, math.floor(most))))
+
+
+def standard_error_of_mean(series: Array, block: int) -> float:
+    """The standard deviation of the mean of a series (N) over its resamples in circular blocks, in closed form.
+
+    Corrected so that blocks of one record give the usual standard error of independent ones.
+    """
+    count = len(series)
+    if count < 2:
+        return float("nan")
+    length = min(block, count)
+    if length == count:
+        return float("nan")
+    around = np.concatenate([series, series[: length - 1]])
+    sums = np.cumsum(np.concatenate([[0.0], around]))
+    means = (sums[length:] - sums[:-length]) / length
+    return float(np.sqrt(np.var(means) * length / count) * np.sqrt(count / (count - length)))
+
+
+def draw_weights(count: int, block: int, random: np.random.Generator) -> Array:
+    """How often each record is drawn (N, summing to N): circular blocks, the last one cut to fit."""
+    length = min(block, count)
+    starts = random.integers(0, count, -(-count // length))
+    drawn: Indices = (starts[:, None] + np.arange(length)[None, :]).ravel()[:count] % count
+    return np.bincount(drawn, minlength=count).astype(float)
+
+
+_FEWEST = 20  # Refits that have to converge for an interval to be stated
+
+
+class BootstrapSettings(Settings):
+    """How often records are resampled; ``blocks`` is how many neighbours are drawn together."""
+
+    bootstrap: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    blocks: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    names: tuple[str, ...]  # of the free canonical entries
+    values: Array  # of each refit that converged (B x n)
+    block: int  # how many neighbours were drawn together
+    failed: int  # how many refits did not converge; they are left out
+
+    @property
+    def deviations(self) -> Array:
+        return self.values.std(axis=0, ddof=1) if self._enough else np.full(len(self.names), np.nan)
+
+    @property
+    def intervals(self) -> Array:
+        if not self._enough:
+            return np.full((len(self.names), 2), np.nan)
+        tail = 50 * (1 - CONFIDENCE)
+        return np.asarray(np.percentile(self.values, [tail, 100 - tail], axis=0).T)
+
+    @property
+    def _enough(self) -> bool:
+        return len(self.values) >= _FEWEST
+
+
+def bootstrap(
+    problem: Problem,
+    estimator: Estimator,
+    estimate: Estimate,
+    settings: BootstrapSettings,
+    executor: Executor | None = None,
+    progress: Progress = no_progress,
+    poses: Indices | None = None,
+) -> Bootstrap:
+    """Refit to resamples of the records (in recorded order) of an estimate; the same seed gives the same refits.
+
+    Records of one pose (``poses``, numbers from 0) are drawn together.
+    """
+    count, random = problem.count, np.random.default_rng(settings.seed)
+    poses = np.arange(count) if poses is None else poses
+    if settings.blocks == "auto":  # the longest that any residual component asks for
+        block = max(automatic_block_length(rows) for rows in problem.whitened_residuals(estimate.values))
+    else:
+        block = min(settings.blocks, count)
+    tasks = []
+    for _ in range(settings.bootstrap):
+        weights = draw_weights(int(poses.max()) + 1, block, random)[poses]
+        chosen = np.flatnonzero(weights).astype(np.intp)
+        tasks.append((chosen, weights[chosen]))
+    refit = partial(_refit, problem, estimator, estimate.values)
+    refits = (executor or Executor(1)).map(refit, tasks, lambda done: progress("bootstrap", done))
+    free = list(estimate.free_entries)
+    values = np.array([values[free] for values in refits if values is not None]).reshape(-1, len(free))
+    return Bootstrap(estimate.names, values, block, sum(values is None for values in refits))
+
+
+def _refit(problem: Problem, estimator: Estimator, start: Array, resample: tuple[Indices, Array]) -> Array | None:
+    chosen, weights = resample
+    some = problem.subset(chosen)
+    try:
+        solution = estimator.solve(some.weighted([weights] * len(some.records)), start)
+    except NotConvergedError:
+        return None
+    return solution.values if solution.verdict.converged else None

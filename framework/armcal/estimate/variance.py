@@ -5,10 +5,8 @@ one for each joint, d r / d q (d r / d q)', what a joint that does not return to
 The thetas are estimated by restricted maximum likelihood [Patterson1971], which counts what the fitted parameters
 took out of the residuals, by average-information steps [Gilmour1995] kept above zero.
 
-Restricted likelihood of variance components in a linear model whose residuals are correlated within records only.
-
-Targets y = J d + e, cov(e_i) = S_i = sum_c theta_c V_ci, and a Gaussian prior on d. With D = S^-1 and
-P = D - D J (J' D J + prior)^-1 J' D [Patterson1971]:
+With targets y = J d + e, cov(e_i) = S_i = sum_c theta_c V_ci, correlated within records only, a Gaussian prior on d,
+D = S^-1 and P = D - D J (J' D J + prior)^-1 J' D [Patterson1971]:
 
     log L = -1/2 (log|S| + log|J' D J + prior| + y' P y)
     slope_c = 1/2 (y' P V_c P y - tr P V_c),    average information_cd = 1/2 y' P V_c P V_d P y    [Gilmour1995]
@@ -50,15 +48,6 @@ class Term:
 
 
 @dataclass(frozen=True)
-class LikelihoodMaximum:
-    """Thetas, the covariance of their estimate, and the log likelihood there."""
-
-    theta: Array
-    covariance: Array
-    log_likelihood: float
-
-
-@dataclass(frozen=True)
 class _Local:
     """Log likelihood, its slope and the average information at some thetas."""
 
@@ -67,18 +56,20 @@ class _Local:
     information: Array
 
 
-def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> LikelihoodMaximum:
-    """The thetas of largest restricted likelihood.
+def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> tuple[Array, Array]:
+    """The thetas of largest restricted likelihood, for bases of mean variance one, and their covariance.
 
-    Args:
-        terms: with bases of mean variance one.
-        prior: information of the prior of each parameter (n).
-        floored: which thetas may not fall to zero (components).
+    ``prior`` is the information of the prior of each parameter (n), ``floored`` says which thetas may not fall to zero.
     """
     count = len(floored)
     # A parameter with a prior takes nothing away: its part of the target is in the sum of squares.
     freedom = max(1, sum(term.target.size for term in terms) - int(np.count_nonzero(prior == 0)))
-    total = _least_squares(terms, prior) / freedom
+    rows = [term.jacobian.reshape(-1, len(prior)) for term in terms]
+    stacked = np.vstack([*rows, np.diag(np.sqrt(prior))])
+    target = np.concatenate([*[term.target.ravel() for term in terms], np.zeros(len(prior))])
+    scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
+    fit = np.linalg.lstsq(stacked / scale, target, rcond=None)[0]
+    total = float(np.sum((target - stacked / scale @ fit) ** 2)) / freedom
     lower = np.where(floored, INSTRUMENT_FLOOR * total, 0.0)
     theta = np.full(count, max(total, 1e-300) / count)
     here = _evaluate(terms, prior, theta)
@@ -99,7 +90,7 @@ def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> LikelihoodM
             break
     scale = np.sqrt(np.maximum(np.diag(here.information), 1e-300))
     covariance = np.linalg.pinv(here.information / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    return LikelihoodMaximum(theta, covariance / np.outer(scale, scale), here.value)
+    return theta, covariance / np.outer(scale, scale)
 
 
 def _raised(
@@ -152,15 +143,6 @@ def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
     return _Local(-0.5 * (logarithm + energy), slope, 0.5 * (curved - reached @ covariance @ reached.T))
 
 
-def _least_squares(terms: Sequence[Term], prior: Array) -> float:
-    rows = [term.jacobian.reshape(-1, len(prior)) for term in terms]
-    stacked = np.vstack([*rows, np.diag(np.sqrt(prior))])
-    target = np.concatenate([*[term.target.ravel() for term in terms], np.zeros(len(prior))])
-    scale = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
-    fit = np.linalg.lstsq(stacked / scale, target, rcond=None)[0]
-    return float(np.sum((target - stacked / scale @ fit) ** 2))
-
-
 Axes = Literal["together", "apart"]
 
 SMALLEST_SHARE = 1e-6
@@ -169,18 +151,12 @@ SMALLEST_SHARE = 1e-6
 
 @dataclass(frozen=True)
 class Component:
-    """One source of variance.
-
-    Attributes:
-        lower, upper: 95 % interval of ``sd``; reaches zero where the data allows it.
-    """
-
     name: str  # an instrument (``tracker``), one of its axes (``tracker.x``) or a joint (``arm.q3``)
-    kind: Literal["instrument", "joint"]  # ``instrument`` or ``joint``
+    kind: Literal["instrument", "joint"]
     unit: str  # of ``sd`` in SI: rad or m for a joint; ``1``, multiples of the declared noise, for an instrument
     sd: float  # standard deviation
     sd_error: float  # its own standard deviation; not a number where it ended at zero
-    lower: float
+    lower: float  # of the 95 % interval of ``sd``; zero where the data allows it
     upper: float
     share: float  # of the variance of all residuals, 0 to 1
     rms: float  # what it contributes to a residual number (m or rad), root mean square over records
@@ -188,12 +164,9 @@ class Component:
 
 @dataclass(frozen=True)
 class VarianceComponents:
-    """How much of the residuals is whose."""
-
     components: tuple[Component, ...]  # in the order of instruments, then joints
     inseparable: tuple[tuple[str, str, float], ...]  # pairs whose estimates correlate beyond 0.95, with the correlation
     unseen: tuple[str, ...]  # joints that move no residual
-    log_likelihood: float  # restricted, up to a constant
     rounds: int = 1  # estimates with refits between them
 
     def share(self, kind: str) -> float:
@@ -213,43 +186,42 @@ class VarianceComponents:
 
 
 def estimate_components(
-    problem: Problem,
-    values: Array,
-    axes: Axes = "together",
-    of_joints: bool = True,
+    problem: Problem, values: Array, axes: Axes = "together", of_joints: bool = True
 ) -> VarianceComponents:
-    """Components at a fit, those of instruments alone unless ``of_joints``.
-
-    ``records`` carry the declared noise, and weight 0 where they are left out.
-    """
+    """Components at a fit, those of instruments alone unless ``of_joints``; left-out records weigh nothing."""
     problem = with_few_points(problem)
     sources = [s for s in _sources(problem, values, axes) if of_joints or s.kind == "instrument"]
     sizes = np.array([_mean_variance(source.bases, problem.records) for source in sources])
     joints = np.array([source.kind == "joint" for source in sources])
     seen = ~joints | (sizes > SMALLEST_SHARE * float(sizes[joints].max(initial=0.0)))
-    _require_freedom(problem, values, int(seen.sum()))
+    if problem.correlation is not None:
+        raise ProblemError(
+            "variance components cannot be estimated beside drifting parameters.",
+            hint="Take the drifts away, or set noise.estimate: false.",
+        )
+    freedom, count = degrees_of_freedom(problem, values), int(seen.sum())
+    if freedom <= 2 * count:
+        raise ProblemError(
+            f"{problem.equations()} equations leave {freedom:.1f} degrees of freedom, too few to estimate "
+            f"{count} variance components from.",
+            hint="Measure more poses, or set noise.estimate: false.",
+        )
     chosen, sizes = [source for source, moves in zip(sources, seen, strict=True) if moves], sizes[seen]
     terms = _terms(problem, values, [source.bases for source in chosen], sizes)
-    maximum = maximise(terms, problem.parameters.prior_information(), ~joints[seen])
+    theta, covariance = maximise(terms, problem.parameters.prior_information(), ~joints[seen])
     # Times the typical noise that is declared of the first measurement.
     roots = noise_roots(problem.kernels[0].factor, problem.records[0])
-    rms = np.sqrt(maximum.theta * np.mean(np.sum(roots**2, axis=2)))
-    deviations = np.sqrt(np.maximum(np.diag(maximum.covariance), 0.0)) / sizes
-    rows = zip(chosen, maximum.theta / sizes, deviations, maximum.theta / maximum.theta.sum(), rms, strict=True)
+    rms = np.sqrt(theta * np.mean(np.sum(roots**2, axis=2)))
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / sizes
+    rows = zip(chosen, theta / sizes, deviations, theta / theta.sum(), rms, strict=True)
     return VarianceComponents(
         tuple(_component(source, *map(float, numbers)) for source, *numbers in rows),
-        correlated_pairs(maximum.covariance, tuple(source.name for source in chosen)),
+        correlated_pairs(covariance, tuple(source.name for source in chosen)),
         tuple(source.name for source, moves in zip(sources, seen, strict=True) if not moves),
-        maximum.log_likelihood,
     )
 
 
-def apply_components(
-    problem: Problem,
-    values: Array,
-    variance_components: VarianceComponents,
-    axes: Axes,
-) -> Problem:
+def apply_components(problem: Problem, values: Array, variance_components: VarianceComponents, axes: Axes) -> Problem:
     """The problem of records whitened by estimated variances."""
     sources = _sources(problem, values, axes)
     variance = {c.name: c.sd**2 for c in variance_components.components}
@@ -320,21 +292,6 @@ def _terms(problem: Problem, values: Array, bases: Sequence[list[Array]], sizes:
         target = residuals[place][:, used].T + jacobian @ moved
         terms.append(Term(target, jacobian, np.moveaxis(own, 3, 1)))
     return terms
-
-
-def _require_freedom(problem: Problem, values: Array, components: int) -> None:
-    if problem.correlation is not None:
-        raise ProblemError(
-            "variance components cannot be estimated beside drifting parameters.",
-            hint="Take the drifts away, or set noise.estimate: false.",
-        )
-    freedom = degrees_of_freedom(problem, values)
-    if freedom <= 2 * components:
-        raise ProblemError(
-            f"{problem.equations()} equations leave {freedom:.1f} degrees of freedom, too few to estimate "
-            f"{components} variance components from.",
-            hint="Measure more poses, or set noise.estimate: false.",
-        )
 
 
 def _component(source: _Source, variance: float, deviation: float, share: float, rms: float) -> Component:

@@ -45,23 +45,18 @@ SHORTEST_JUMP_S = 600.0
 
 @dataclass(frozen=True)
 class Layout:
-    """What the channels of a dataset are, and what they were called in its source.
-
-    Attributes:
-        units: channel to the unit that its column declares; absent or SI means SI.
-        parts: channel to the measurements that need it; one that is absent belongs to the record as a whole.
-    """
+    """What the channels of a dataset are, and what they were called in its source."""
 
     joints: tuple[str, ...] = ()  # channels of commanded joint displacements, revolute (angle) and prismatic (length)
     revolute: tuple[str, ...] = ()  # those of ``joints`` that turn, but not on and on
     approach: tuple[str, ...] = ()  # channels of approach directions
     measured: tuple[str, ...] = ()  # channels of measured values, ``instance.name``
     columns: Mapping[str, str] = field(default_factory=dict)  # channel to its column in the source, for messages
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  # channel to the unit that its column declares, else SI
     by_line: bool = False  # whether ``Dataset.rows`` are lines of a text file; otherwise they are row numbers
     deviations: tuple[str, ...] = ()  # channels of their standard deviations
     by_id: bool = False  # whether a record's id says where it stood, better than its row does
-    parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    parts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # measurements that need it; none: all do
     of_points: frozenset[str] = frozenset()  # channels of points, of which a record may lack some but not all
     evidence: frozenset[str] = frozenset()  # channels that only the verdict reads, which a record may lack
 
@@ -95,8 +90,7 @@ def layout_of(
 ) -> Layout:
     """The layout of a dataset that was read for some wanted channels.
 
-    A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other channel that belongs
-    to an instance is measured; one that belongs to none (``payload``) describes the surroundings.
+    A channel that has an approach (``arm.approach.q1``) is a joint (``arm.q1``); any other of an instance is measured.
     """
     approach = [w.channel for w in requested_channels if _APPROACH in w.channel]
     moved = {joint.channel for joints in joints_by_arm(requested_channels).values() for joint in joints}
@@ -166,22 +160,14 @@ def read_as(
     by_line: bool = True,
     by_id: bool = False,
 ) -> Dataset:
-    """What a reader gives back: its records with all that a request needs, checked; see ``Layout`` for the rest.
-
-    Raises:
-        DataError: the dataset is refused, or no record is left.
-    """
+    """What a reader gives back: its records with all that a request needs, checked; see ``Layout`` for the rest."""
     dataset = with_absent(dataset, request.channels)
     layout = layout_of(request.channels, dataset, columns, units, by_line=by_line)
     return check_dataset(dataset, replace(layout, by_id=by_id))
 
 
 def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
-    """All checks: those that refuse or set aside, then warnings.
-
-    Raises:
-        DataError: the dataset is refused, or no record is left.
-    """
+    """All checks: those that refuse or set aside, then warnings."""
     dataset = warn_kelvin(warn_small_degrees(check_records(dataset, layout), layout), layout)
     return warn_repeated_poses(dataset, layout)
 
@@ -191,9 +177,6 @@ def check_records(dataset: Dataset, layout: Layout) -> Dataset:
 
     Records that passed it pass it again as they are: readers make it with the names and units of their source, and
     ``records_of`` once more, for those that do not.
-
-    Raises:
-        DataError: the dataset is refused, or no record is left.
     """
     dataset = set_aside_without_noise(set_aside_not_finite(dataset, layout), layout)
     refuse_impossible(dataset, layout)
@@ -230,16 +213,13 @@ def set_aside_not_finite(dataset: Dataset, layout: Layout) -> Dataset:
         spared = layout.parts.get(channel) or channel in layout.evidence
         lost |= np.isinf(values) if spared else ~np.isfinite(values)
     faulty = {int(index): _reason(dataset, layout, int(index)) for index in np.flatnonzero(lost)}
-    why = f"values are missing or not finite: {_missing(dataset.subset(np.flatnonzero(lost)), layout)}"
+    counts = {name: int(np.sum(~np.isfinite(values[lost]))) for name, values in dataset.channels.items()}
+    most = sorted((name for name, count in counts.items() if count), key=lambda name: -counts[name])
+    listed = ", ".join(f"{layout.column(name)} in {counts[name]}" for name in most[:_MOST_COUNTED])
+    more = f" and {len(most) - _MOST_COUNTED} columns more" if len(most) > _MOST_COUNTED else ""
+    why = f"values are missing or not finite: {listed}{more}"
     kept = set_aside(dataset, layout, faulty, why, "Fill them in, or measure these again.")
     return _without_incomplete(kept, layout, {part: mask[~lost] for part, mask in complete.items()})
-
-
-def _missing(dataset: Dataset, layout: Layout) -> str:
-    counts = {name: int(np.sum(~np.isfinite(values))) for name, values in dataset.channels.items()}
-    most = sorted((name for name, count in counts.items() if count), key=lambda name: -counts[name])
-    more = f" and {len(most) - _MOST_COUNTED} columns more" if len(most) > _MOST_COUNTED else ""
-    return ", ".join(f"{layout.column(name)} in {counts[name]}" for name in most[:_MOST_COUNTED]) + more
 
 
 def _reason(dataset: Dataset, layout: Layout, index: int) -> str:
@@ -302,15 +282,9 @@ def with_absent(dataset: Dataset, requested_channels: Sequence[RequestedChannel]
 
 
 def refuse_joint_count(names: Sequence[str], requested_channels: Sequence[RequestedChannel], where: Location) -> None:
-    """Columns of another arm: it has more or fewer joints than the one that is wanted.
+    """Refuse columns (``names``, with their unit suffixes) of an arm with more or fewer joints than the wanted one.
 
-    Args:
-        names: every column of the source, with its unit suffix if it has one.
-        requested_channels: the channels; each arm's joints are those with an approach.
-        where: the header.
-
-    Raises:
-        DataError: with both counts; not if no column at all is a joint's, which is a matter of names.
+    Not if no column at all is a joint's, which is a matter of names.
     """
     for arm, joints in joints_by_arm(requested_channels).items():
         own = {name for joint in joints for name in joint.columns}
@@ -334,11 +308,6 @@ def refuse_joint_count(names: Sequence[str], requested_channels: Sequence[Reques
 
 
 def require_records(dataset: Dataset) -> Dataset:
-    """The dataset, if it has a record.
-
-    Raises:
-        DataError: every record was set aside, or there was none.
-    """
     if len(dataset):
         return dataset
     first = dataset.set_aside[0] if dataset.set_aside else None
@@ -361,12 +330,7 @@ def set_aside_without_noise(dataset: Dataset, layout: Layout) -> Dataset:
 
 
 def refuse_impossible(dataset: Dataset, layout: Layout) -> None:
-    """Approaches, payloads and times that cannot be.
-
-    Raises:
-        DataError: an approach that is no sign, a payload below zero, or a time after the year 5000: milliseconds
-            called seconds.
-    """
+    """Refuse an approach that is no sign, a payload below zero, or a time after the year 5000 (milliseconds)."""
     sign = "Write the sign of the joint's last motion before the pose, 0 if it is not known."
     clock = "If these are milliseconds, end the column's name in _ms (time_ms), microseconds in _us."
     kinds: list[tuple[str, Callable[[Array], Mask], str, str]] = [
@@ -383,7 +347,6 @@ def refuse_impossible(dataset: Dataset, layout: Layout) -> None:
 
 
 def warn_kelvin(dataset: Dataset, layout: Layout) -> Dataset:
-    """Warn of temperatures that no arm has in degrees Celsius."""
     if not dataset.has("temperature") or not len(dataset):
         return dataset
     typical = float(np.nanmedian(dataset.column("temperature")))
@@ -394,11 +357,7 @@ def warn_kelvin(dataset: Dataset, layout: Layout) -> Dataset:
 
 
 def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
-    """Angles of revolute joints that cannot be in the unit they declare.
-
-    Raises:
-        DataError: radians beyond one turn, or degrees beyond two.
-    """
+    """Refuse radians beyond one turn, or degrees beyond two, of revolute joints."""
     for channel in layout.revolute if len(dataset) else ():
         values, unit, column = _known(dataset, channel), layout.units.get(channel, "rad"), layout.column(channel)
         first = int(np.argmax(np.abs(values)))
@@ -439,11 +398,6 @@ def warn_small_degrees(dataset: Dataset, layout: Layout) -> Dataset:
 
 
 def refuse_conflicting_ids(dataset: Dataset, layout: Layout) -> None:
-    """An id names one record.
-
-    Raises:
-        DataError: two records with different contents share an id.
-    """
     if len(set(dataset.ids)) == len(dataset):
         return
     contents = _first_alike(dataset, tuple(dataset.channels))
@@ -460,11 +414,7 @@ def refuse_conflicting_ids(dataset: Dataset, layout: Layout) -> None:
 
 
 def set_aside_backward_time(dataset: Dataset, layout: Layout) -> Dataset:
-    """Set aside records that are earlier than one before them.
-
-    Raises:
-        DataError: that is more than 1 % of the records.
-    """
+    """Set aside records that are earlier than one before them; refuse more than 1 % of them."""
     if not dataset.has("time") or not len(dataset):
         return dataset
     time = dataset.channels["time"]
@@ -572,7 +522,6 @@ def _first_alike(dataset: Dataset, channels: Sequence[str]) -> Indices:
 
 
 def set_aside(dataset: Dataset, layout: Layout, faulty: Mapping[int, str], why: str, mend: str) -> Dataset:
-    """The dataset without some records (index to reason), and with a warning that says so."""
     if not faulty:
         return dataset
     first = layout.place(dataset, min(faulty))
@@ -586,11 +535,7 @@ def warned(dataset: Dataset, text: str) -> Dataset:
 
 
 def require_conditions(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> None:
-    """Refuse records without a column that an effect reads, whatever reader they come from.
-
-    Raises:
-        DataError: with effect, column and source.
-    """
+    """Refuse records without a column that an effect reads, whatever reader they come from."""
     for channel in requested_channels:
         if channel.effects and channel.required and not dataset.has(channel.channel):
             raise DataError(
@@ -601,10 +546,9 @@ def require_conditions(dataset: Dataset, requested_channels: Sequence[RequestedC
 
 
 def noticed(dataset: Dataset) -> Dataset:
-    """The dataset, with a warning for each unused column that looks like a misspelt one, and for a jump in time.
+    """The dataset with a warning for each unused column that looks like a misspelt one, and for a jump in time.
 
-    Raises:
-        DataError: a vector has some of its components only; the missing ones are not guessed.
+    Refuses a vector that has some of its components only; the missing ones are not guessed.
     """
     for vector in ("gravity", "force", "torque", "payload"):
         parts = [f"{vector}_{axis}" for axis in "xyz"]

@@ -34,11 +34,7 @@ class PairedMeasurement(Protocol):
 
 
 def with_partners(dataset: Dataset, measurements: Mapping[str, Measurement]) -> Dataset:
-    """The dataset with the joints of other records beside those of the records that name them; else not a number.
-
-    Raises:
-        DataError: a record names one that is not there, or itself.
-    """
+    """The dataset with the joints of other records beside those of the records that name them; else not a number."""
     channels: dict[str, Array] = {}
     for measurement in measurements.values():
         if isinstance(measurement, PairedMeasurement):
@@ -76,14 +72,10 @@ _FORBIDDEN = frozenset("[]*?\"'")
 
 @dataclass(frozen=True)
 class OwnedTie:
-    """A tie with the full names of the parameters it holds together.
+    """A tie with the full names of the parameters it holds together."""
 
-    Attributes:
-        names: local names of each group's parameters to full ones, one mapping a group.
-    """
-
-    names: tuple[Mapping[str, str], Mapping[str, str]]
-    tie: Tie  # what is known
+    names: tuple[Mapping[str, str], Mapping[str, str]]  # of each group's parameters, local to full
+    tie: Tie
 
 
 def owner_of(instance: str, measurement: GroupedMeasurement) -> str:
@@ -91,12 +83,7 @@ def owner_of(instance: str, measurement: GroupedMeasurement) -> str:
 
 
 def groups_of(dataset: Dataset, measurements: Mapping[str, Measurement]) -> dict[str, tuple[str, ...]]:
-    """The groups in a dataset, sorted, so that the order of records means nothing.
-
-    Raises:
-        DataError: a label is missing, or unfit for a name.
-        ConfigError: a measurement uses the groups of one that has no such groups.
-    """
+    """The groups in a dataset, sorted, so that the order of records means nothing."""
     groups: dict[str, set[str]] = {}
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement):
@@ -122,11 +109,7 @@ def unmatched(measurements: Mapping[str, Measurement], groups: Groups) -> list[s
 
 
 def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str, ...]:
-    """The key of each record's group; empty where a label is.
-
-    Raises:
-        DataError: a label is missing, or unfit for a name.
-    """
+    """The key of each record's group; empty where a label is."""
     if not measurement.group_labels:
         return (ONLY,) * len(dataset)
     columns = []
@@ -165,11 +148,7 @@ def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, gro
 
 
 def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost: Mask) -> None:
-    """Refuse records that belong to no measurement, for want of a group.
-
-    Raises:
-        DataError: there are some.
-    """
+    """Refuse records that belong to no measurement, for want of a group."""
     if not lost.any():
         return
     if not measurements:
@@ -211,7 +190,6 @@ def group_name(owner: str, key: str, local: str) -> str:
 
 
 def ties_of(measurements: Mapping[str, Measurement], groups: Groups) -> tuple[OwnedTie, ...]:
-    """All that is known between groups."""
     owned_ties = []
     for instance, measurement in measurements.items():
         if isinstance(measurement, GroupedMeasurement):

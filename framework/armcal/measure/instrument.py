@@ -80,11 +80,7 @@ class ArmsAlone(Contact):
 
 
 def named_arm(text: str | None, arm_names: Sequence[str]) -> str:
-    """The arm that a configuration names, or the only one.
-
-    Raises:
-        ValueError: there is no such arm, or several and none is named.
-    """
+    """The arm that a configuration names, or the only one; else a ValueError."""
     if not arm_names:
         raise ValueError("there is no arm; describe one under arms")
     if text is None and len(arm_names) != 1:
@@ -154,13 +150,9 @@ class Instrument(Measurement, ABC):
 
 @dataclass(frozen=True)
 class Proposal:
-    """Where a measurement's own parameters may start.
+    """Where a measurement's own parameters may start."""
 
-    Attributes:
-        values: canonical entries by local name; none where nothing could be found.
-    """
-
-    values: Mapping[str, Array] = field(default_factory=dict)
+    values: Mapping[str, Array] = field(default_factory=dict)  # canonical entries by local name, of what was found
     open: str = ""  # what the records leave open, a sentence; empty if nothing
     close: str = ""  # which further records would close it, a sentence
     undetermined: tuple[str, ...] = ()  # local names of the parameters that are left open
@@ -170,9 +162,8 @@ class Proposal:
 class Reading:
     """What a measurement read in N records, and where its arm was.
 
-    Attributes:
-        frames: base_T_tool of each record (N x 4 x 4, m) as ``tool``, and ``base``; for one that is ``Carried``, the
-            poses of its carriers.
+    ``frames`` are base_T_tool of each record (N x 4 x 4, m) as ``tool``, and ``base``; of one that is ``Carried``, the
+    poses of its carriers.
     """
 
     frames: Mapping[str, Array]

@@ -61,8 +61,7 @@ class RecordNoise(Protocol):
 class Tie:
     """What is known between two groups, beside all records: the distance of two sockets.
 
-    Attributes:
-        residual: of the values of their parameters, under local names, to what is left open (n x 1, m or rad).
+    ``residual`` takes the values of their parameters, under local names, to what is left open (n x 1, m or rad).
     """
 
     groups: tuple[str, str]  # their keys
@@ -171,9 +170,8 @@ class HasScale(Protocol):
 class Mistake:
     """Something that may have gone wrong with an instrument.
 
-    Attributes:
-        course: how it changes over the recording; ``always`` is no change, and looked for in those that are fixed,
-            each of one number.
+    ``course`` is how it changes over the recording; what is there ``always`` is looked for in those parameters that are
+    fixed, each of one number.
     """
 
     kind: str  # in a word, ``focus``

@@ -16,11 +16,7 @@ from armcal.measure.measurement import Measurement, noise_channels
 
 @dataclass(frozen=True)
 class RequestedChannel:
-    """One number a record may carry.
-
-    Attributes:
-        parts: the measurements (instances) that need it; none if the record as a whole does, or nothing does.
-    """
+    """One number a record may carry."""
 
     channel: str  # its name in a dataset (``arm.q1``, ``tracker.x``, ``gravity_x``)
     columns: tuple[str, ...]  # names it may have in a file, without the unit suffix, the most specific first
@@ -28,7 +24,7 @@ class RequestedChannel:
     required: bool  # whether a record without it is useless
     is_deviation: bool = False  # whether it is the standard deviation of a measured number
     is_endless: bool = False  # whether it is the angle of a joint that may turn on and on
-    parts: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()  # the measurements that need it; none if the record as a whole does, or nothing
     effects: tuple[str, ...] = ()  # the joint effects (``arm.thermal``) that read it
     is_of_point: bool = False  # whether it belongs to one of many points, of which a record may lack some
     is_evidence: bool = False  # whether only the verdict reads it, so that a record that lacks it loses nothing
@@ -85,8 +81,7 @@ ENVIRONMENT: tuple[tuple[str, str], ...] = (
 def surroundings(arms: Mapping[str, Arm]) -> dict[str, str]:
     """Columns of what surrounds the arms, with their dimensions: of any record, then those that effects declare.
 
-    Raises:
-        ValueError: an effect declares a column whose name, dimension or meaning is not clear.
+    ValueError if an effect declares a column whose name, dimension or meaning is not clear.
     """
     known = dict(ENVIRONMENT)
     joints = {joint for arm in arms.values() for joint in arm.commanded}

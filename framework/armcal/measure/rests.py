@@ -31,8 +31,6 @@ _TINY_M = 1e-9
 
 @dataclass(frozen=True)
 class Stillness:
-    """Whether some poses are those of an arm that stands."""
-
     why_not: str  # why they are not those of an arm that stands, a sentence; empty if they are
     kept: Mask  # which poses count (N); the others lie far off
 

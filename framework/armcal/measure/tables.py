@@ -2,7 +2,8 @@
 
 A file is read once, line by line, and its columns become numbers a few hundred rows at a time, so that neither a long
 file nor a broken one takes much memory. A single bad cell is looked for only when a column fails. Where rows come one
-at a time, each is judged as it comes, by the same rules.
+at a time, each is judged as it comes, by the same rules. A dataset is written so that it reads back to the same SI
+values.
 
 Names of columns carry the unit as suffix (``q1_deg``, ``x_mm``); a mapping gives a file's own names in place of these.
 """
@@ -11,6 +12,7 @@ import csv
 import difflib
 import hashlib
 import io
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,14 +20,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import BinaryIO, NoReturn, Self
 
 import numpy as np
 
 from armcal.base.arrays import Array
-from armcal.base.units import DIMENSIONLESS, UNITS, display_unit, units_of
+from armcal.base.dataset import Dataset
+from armcal.base.units import DIMENSIONLESS, UNITS, display_unit, to_unit, units_of
 from armcal.errors import DataError, Location
-from armcal.io.plain_files import input_file, refuse, text_of
+from armcal.io.plain_files import input_file, refuse, text_of, write_over
 from armcal.measure.checks import refuse_joint_count
 from armcal.measure.reader import ID_NAMES, RequestedChannel
 
@@ -70,11 +74,7 @@ def is_missing(text: str) -> bool:
 
 
 def read_cell(cell: str, where: Location | None = None) -> float:
-    """The number in a cell; NaN if its value is missing.
-
-    Raises:
-        DataError: it holds none.
-    """
+    """The number in a cell, NaN if its value is missing; a DataError if it holds none."""
     if is_number(cell):
         return float(cell)
     if is_missing(cell):
@@ -113,15 +113,10 @@ class Columns:
 
 @dataclass(frozen=True)
 class Table:
-    """A table that is open; its rows, those that are not blank, are read once.
-
-    Attributes:
-        first: its first row, a header or not.
-        rest: the rows after it.
-    """
+    """A table that is open; its rows, those that are not blank, are read once."""
 
     path: Path
-    first: Row
+    first: Row  # a header or not
     rest: Iterator[Row]
     _digest: "hashlib._Hash"
 
@@ -146,9 +141,6 @@ class Table:
             has_header: whether the first row is one; else it is read too.
             number: reads a cell that is no plain number; by default ``read_cell``.
             plain: whether a cell that Python reads as a number is that number.
-
-        Raises:
-            DataError: with file, line and column.
         """
         rows, width = self.rest if has_header else chain([self.first], self.rest), len(self.first[1])
 
@@ -177,33 +169,20 @@ class Table:
 
 @dataclass(frozen=True)
 class LineTable:
-    """A table whose rows come one at a time, each judged as it comes; a quoted cell ends on the line of its begin.
+    """A table whose rows come one at a time, each judged as it comes; a quoted cell ends on the line of its begin."""
 
-    Attributes:
-        source: what it is called in messages.
-        header: the cells of its first row.
-    """
-
-    source: str
+    source: str  # what it is called in messages
     delimiter: str
-    header: tuple[str, ...]
+    header: tuple[str, ...]  # the cells of its first row
 
     @classmethod
     def begun(cls, text: str, source: str, line: int) -> Self:
-        """By its header, in which the delimiter is the likeliest one.
-
-        Raises:
-            DataError: it is not CSV.
-        """
+        """By its header, in which the delimiter is the likeliest one."""
         delimiter = delimiter_of(text)
         return cls(source, delimiter, tuple(_split(text, source, line, delimiter)))
 
     def row(self, text: str, line: int) -> list[str]:
-        """The cells of a further line that is not blank.
-
-        Raises:
-            DataError: it is not CSV, or has another number of cells than the header.
-        """
+        """The cells of a further line that is not blank."""
         cells = _split(text, self.source, line, self.delimiter)
         if len(cells) != len(self.header):
             _refuse_ragged(self.source, line, cells, len(self.header), True)
@@ -226,7 +205,6 @@ def _refuse_not_csv(source: Path | str, fault: csv.Error, line: int) -> NoReturn
 
 
 def _split(text: str, source: Path | str, line: int, delimiter: str) -> list[str]:
-    """The cells of one line."""
     if delimiter == BLANKS:
         return [cell.strip('"') for cell in text.split()]
     try:
@@ -245,7 +223,7 @@ def open_table(
     empty: str = "Give a header and one line a record.",
     content: bytes | None = None,
 ) -> Iterator[Table]:
-    """A file as a table.
+    """A file as a table; a DataError, also while its rows are read, if it is empty or no text.
 
     Args:
         path: of the file.
@@ -254,9 +232,6 @@ def open_table(
         most: bytes that it may have.
         empty: what to do if it is empty.
         content: of the file, where it was read already.
-
-    Raises:
-        DataError: it cannot be read, is empty or no text; also while its rows are read.
     """
     digest = hashlib.sha256()
     try:
@@ -282,7 +257,6 @@ def _text_lines(file: BinaryIO, path: Path, digest: "hashlib._Hash") -> Iterator
 
 
 def _rows(lines: Iterator[str], path: Path, delimiter: str) -> Iterator[Row]:
-    """Rows that are not blank."""
     begun = 1
     if delimiter == "auto":
         for text in lines:
@@ -315,11 +289,7 @@ _ID_HEADER = "Give a header pose_id and an id a line."
 
 
 def read_ids(path: Path) -> tuple[str, ...]:
-    """The ids in a file, in its order.
-
-    Raises:
-        DataError: no such file, no text, no ids, or an id stands twice.
-    """
+    """The ids in a file, in its order."""
     with open_table(path, "a list of ids", most=MAX_ID_LIST_BYTES, empty=_ID_HEADER) as table:
         header = [cell.strip().lower() for cell in table.first[1]]
         column = next((header.index(name) for name in ID_NAMES if name in header), None)
@@ -339,24 +309,19 @@ MAX_COLUMNS = 4000
 
 @dataclass(frozen=True)
 class Column:
-    """One column: its place (from 0), its name in the file, and the name it goes by."""
-
-    index: int
-    name: str
+    index: int  # from 0
+    name: str  # in the file
     known_as: str
 
 
 @dataclass(frozen=True)
 class Header:
-    """The columns of a source, and the line that names them (none where every record names its own).
-
-    ``layout_hint`` is that of the request.
-    """
+    """The columns of a source."""
 
     source: str
-    line: int | None
+    line: int | None  # the line that names them; none where every record names its own
     columns: tuple[Column, ...]
-    layout_hint: str = ""
+    layout_hint: str = ""  # that of the request
 
     def refuse(self, message: str, hint: str, column: str | None = None) -> NoReturn:
         raise DataError(message, where=Location(self.source, line=self.line, field=column), hint=hint)
@@ -368,19 +333,15 @@ class Header:
 
 @dataclass(frozen=True)
 class Plan:
-    """Which column is what: channel to column and unit, the id's column, and the rest."""
+    """Which column is what."""
 
-    channels: Mapping[str, tuple[Column, str]]
+    channels: Mapping[str, tuple[Column, str]]  # with the unit
     record_id: Column | None
     extra: tuple[Column, ...]
 
 
 def header_of(cells: Sequence[str], source: str, line: int | None, layout_hint: str = "") -> Header:
-    """A header from its cells.
-
-    Raises:
-        DataError: it has no names, too many, a nameless column, or numbers for names.
-    """
+    """A header from its cells; a DataError if it has no names, too many, a nameless column, or numbers for names."""
     names = [cell.strip() for cell in cells]
     header = Header(source, line, tuple(Column(i, name, name) for i, name in enumerate(names)), layout_hint)
     if not names:
@@ -401,11 +362,7 @@ def header_of(cells: Sequence[str], source: str, line: int | None, layout_hint: 
 
 
 def renamed(header: Header, columns: Mapping[str, str]) -> Header:
-    """The header with the file's own names replaced by the wanted ones (wanted name to own name).
-
-    Raises:
-        DataError: a column that the mapping names is not there, or two columns go by one name.
-    """
+    """The header with the file's own names replaced by the wanted ones (wanted name to own name)."""
     names = [column.name for column in header.columns]
     by_column = {own: name for name, own in columns.items()}
     for name, own in columns.items():
@@ -431,11 +388,6 @@ def renamed(header: Header, columns: Mapping[str, str]) -> Header:
 
 
 def match_columns(header: Header, requested_channels: Sequence[RequestedChannel]) -> Plan:
-    """Find every wanted channel's column.
-
-    Raises:
-        DataError: a required channel has no column, or a column is ambiguous or has no unit.
-    """
     by_name = {column.known_as: column for column in header.columns}
     channels: dict[str, tuple[Column, str]] = {}
     claimed: dict[str, str] = {}
@@ -492,7 +444,6 @@ def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Colum
 
 
 def refuse_missing(header: Header, w: RequestedChannel, unused: Sequence[str]) -> NoReturn:
-    """Raise a DataError: no column is this channel's; ``unused`` names come near it, perhaps."""
     spelled = spellings(replace(w, columns=(min(w.columns, key=len),)))
     written, usual = " or ".join(spelled), {unit: name for name, unit in spelled.items()}
     example = usual.get("1") or usual[display_unit(w.dimension).name]
@@ -509,3 +460,85 @@ def _nearest(names: Iterable[str], columns: Sequence[str]) -> str:
     if near:
         return f"; the nearest is {' or '.join(dict.fromkeys(near))}"
     return f"; found {', '.join(name[:64] for name in columns[:8]) or 'no other'}"
+
+
+ID_COLUMN = "pose_id"
+_CUSTOMARY: Mapping[str, str] = MappingProxyType({})
+
+
+def write_csv(
+    path: str | Path,
+    dataset: Dataset,
+    requested_channels: Sequence[RequestedChannel],
+    units: Mapping[str, str] = _CUSTOMARY,
+) -> None:
+    """Write all records: ``pose_id``, the channels in the order of ``requested_channels``, then the extra columns.
+
+    The file appears whole or not at all; one that is there already is replaced, but no link and no device. Numbers are
+    written in full, so that reading them back gives the same SI values within one unit in the last place.
+
+    Args:
+        path: where to; its folder must exist.
+        dataset: SI values.
+        requested_channels: what the columns of each channel may be called; the shortest name that only one has is used.
+        units: of a column by its dimension; by default deg, mm, g, and otherwise the SI unit.
+    """
+    path = Path(path)
+    columns = _columns(path, dataset, requested_channels, units)
+    write_over({path: csv_text([columns, *zip(*columns.values(), strict=True)]).encode()})
+
+
+def _columns(
+    path: Path, dataset: Dataset, requested_channels: Sequence[RequestedChannel], units: Mapping[str, str]
+) -> dict[str, Sequence[str]]:
+    unknown = sorted(set(dataset.channels) - {w.channel for w in requested_channels})
+    if unknown:
+        raise DataError(
+            f"no column is known for the channel {unknown[0]}.",
+            where=Location(str(path)),
+            hint="Name it among the wanted channels, or leave it out of the dataset.",
+        )
+    columns: dict[str, Sequence[str]] = {ID_COLUMN: dataset.ids}
+    names = column_names([w for w in requested_channels if dataset.has(w.channel)], units)
+    written: dict[str, Sequence[str]] = {}
+    for channel, (column, unit) in names.items():
+        values = to_unit(dataset.channels[channel], unit).tolist()
+        numbers = [int(x) if unit == "1" and x.is_integer() else x for x in values]
+        written[column] = ["" if math.isnan(number) else repr(number) for number in numbers]
+    for name, texts in [*written.items(), *dataset.extra.items()]:
+        if name in columns:
+            raise DataError(
+                f"two columns would be called {name}.",
+                where=Location(str(path), field=name),
+                hint="Rename the extra column.",
+            )
+        columns[name] = texts
+    return columns
+
+
+def column_names(
+    requested_channels: Sequence[RequestedChannel], units: Mapping[str, str] = _CUSTOMARY
+) -> dict[str, tuple[str, str]]:
+    """The column of each channel, with its unit as suffix, and the unit (``"1"``: none)."""
+    taken = [name for w in requested_channels for name in set(w.columns)]
+    columns = {}
+    for w in requested_channels:
+        own = [name for name in w.columns if taken.count(name) == 1] or [w.columns[0]]
+        unit, name = "1", min(own, key=len)
+        if w.dimension not in ("1", DIMENSIONLESS):
+            unit = units.get(w.dimension) or display_unit(w.dimension).name
+            known = [u.name for u in units_of(w.dimension)]
+            if unit not in known:
+                raise ValueError(f"{unit!r} is not a unit of {w.dimension}; expected one of {', '.join(known)}.")
+        columns[w.channel] = (name if unit == "1" else f"{name}_{unit}", unit)
+    return columns
+
+
+def csv_text(rows: Iterable[Iterable[object]], number: str = ".6f") -> str:
+    """Rows as the text of a CSV file, floats in a format; one that is not finite is an empty cell."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for row in rows:
+        cells = [(format(x, number) if math.isfinite(x) else "") if isinstance(x, float) else x for x in row]
+        writer.writerow(cells)
+    return text.getvalue()

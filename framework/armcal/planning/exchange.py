@@ -19,8 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armcal.base.arrays import Array, Indices, Mask
-from armcal.planning.candidates import Candidates, log_determinant, value_of
-from armcal.planning.relaxation import AT_ONCE, Relaxation, Task, relax
+from armcal.planning.candidates import AT_ONCE, Candidates, Relaxation, Task, log_determinant, relax, value_of
 
 Rows = Callable[[Array], Array]  # Poses (joints x N) to whitened Jacobians (n_r x N x n)
 Allowed = Callable[[Array], Mask]  # Poses (joints x N) to whether each may be visited (N, bool)
@@ -40,8 +39,6 @@ _FIRST_STEP, _SHRINK, _GAIN = 0.125, 0.5, 1e-9  # of a pose that is moved throug
 
 @dataclass(frozen=True)
 class Plan:
-    """A chosen set of poses."""
-
     chosen: Indices  # in the order in which each adds most to those before it
     value: float  # the log determinant, with what is known before
     starts: int  # how many were made
@@ -49,7 +46,7 @@ class Plan:
 
 
 def choose(task: Task, starts: int = STARTS, seed: int = 0, begin: Indices | None = None) -> Plan:
-    """The best plan of several starts.
+    """The best plan of several starts; ValueError with fewer candidates than poses.
 
     Args:
         task: candidates and number of poses.
@@ -57,9 +54,6 @@ def choose(task: Task, starts: int = STARTS, seed: int = 0, begin: Indices | Non
             kicks of the best plan.
         seed: of what is random.
         begin: a plan to start from as well.
-
-    Raises:
-        ValueError: fewer candidates than poses.
     """
     if task.count > task.candidates.count:
         raise ValueError(f"{task.count} poses of {task.candidates.count} candidates")
@@ -328,11 +322,8 @@ def refine(poses: Array, limits: Array, known: Array, rows: Rows, allowed: Allow
         limits: of each joint (joints x 2).
         known: information before the plan, by coordinates in typical scales (n x n).
         rows: Jacobians of poses.
-        allowed: clearance.
+        allowed: clearance of poses that are moved.
         sweeps: how often each pose is tried.
-
-    Returns:
-        the poses (joints x N), within limits and allowed where they were moved.
     """
     poses = np.array(poses)
     held = rows(poses)

@@ -13,9 +13,8 @@ from armcal.base.dataset import Dataset
 from armcal.base.units import display_unit, to_unit
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import deviations
-from armcal.planning.candidates import Candidates, whitened_rows
+from armcal.planning.candidates import Candidates, Task, whitened_rows
 from armcal.planning.exchange import built_up
-from armcal.planning.relaxation import Task
 from armcal.problem.problem import Problem, triangular
 
 CANDIDATES = 400

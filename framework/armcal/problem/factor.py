@@ -47,15 +47,10 @@ _POINT = "point."
 class Factor(ElasticPass):
     """The expressions of one measurement.
 
-    Attributes:
-        values: free canonical entries (symbols, n_v); fixed ones are numbers in the expressions.
-        record: symbols, one a channel.
-        state: deflections of all arms that take part (symbols, n_d).
-        noise_channels: of each residual entry, the channels that may carry a record's own one, the nearest first.
-        nuisance_starts: entries of the group's parameters by the record alone, to start from; empty for none.
-        points: what distinguishes the points of a measurement that reads the same of many (P x k); None of any other.
-            Channels, noise and dimensions are then those of all points, and ``of_point`` has the expressions.
-        of_point: the factor of one point: its channels are the shared ones, its own, and the k numbers of the point.
+    ``values`` are the free canonical entries (symbols, n_v; fixed ones are numbers in the expressions), ``record`` a
+    symbol a channel, ``state`` the deflections of all arms that take part (symbols, n_d). Of a measurement that reads
+    the same of many points, channels, noise and dimensions are those of all points, and ``of_point`` has the
+    expressions: its channels are the shared ones, its own, and the k numbers of the point.
     """
 
     name: str  # the measurement's instance name
@@ -65,13 +60,13 @@ class Factor(ElasticPass):
     outputs: Expression  # what the instrument would read (n_o), named by ``output_channels``
     tools: Expression  # each arm's base_T_tool without its last row, column by column (12 an arm; m)
     noise: tuple[float, ...]  # standard deviation of each residual entry
-    noise_channels: tuple[tuple[str, ...], ...] = ()
+    noise_channels: tuple[tuple[str, ...], ...] = ()  # of each entry, those that may carry its own one, nearest first
     dimensions: tuple[str, ...] = ()  # ``length`` or ``angle`` of each residual entry
-    nuisance_starts: Expression = None
+    nuisance_starts: Expression = None  # entries of the group's parameters by the record alone; empty for none
     nuisance_names: tuple[str, ...] = ()  # local names of the parameters of these entries, one an entry
     mean_weight: float = 1.0  # how many times more the mean of a group's residuals weighs
     joints: tuple[tuple[str, str], ...] = ()  # channels of commanded joints, each with ``angle`` or ``length``
-    points: Array | None = None
+    points: Array | None = None  # what distinguishes them (P x k)
     of_point: Factor | None = None
     margin: Expression = None  # of one point, above zero where it is in view; None where the view is not limited
 
@@ -85,7 +80,6 @@ class Factor(ElasticPass):
 
     @property
     def expressed(self) -> Factor:
-        """The factor that has the expressions: of one point, where there are many; else this one."""
         return self.of_point or self
 
     @property
@@ -133,8 +127,8 @@ class Factor(ElasticPass):
     def hessian_function(self) -> ca.Function:
         """(values, record, state, W) -> exact Hessian (n_v x n_v) of half of |W residual|^2, in equilibrium.
 
-        W (n_r x n_r) is the whitening.
-        The second derivative of the Lagrangian along the equilibrium's tangent. [Griewank2008]
+        W (n_r x n_r) is the whitening. The Lagrangian's second derivative along the equilibrium's tangent.
+        [Griewank2008]
         """
         whitening = ca.SX.sym("whitening", self.residual.numel(), self.residual.numel())
         inputs = [*self._inputs, whitening]
@@ -168,18 +162,15 @@ class _Records:
     """A symbol for each channel that an expression reads, in the order in which they are read first."""
 
     def __init__(self, available: frozenset[str]) -> None:
-        self._available = available
+        self.available = available
         self.symbols: dict[str, Expression] = {}
         self.kept: set[str] = set()  # what pose residuals read
-
-    def has(self, channel: str) -> bool:
-        return channel in self._available
 
     def number(self, channel: str) -> Expression:
         return self.symbols.setdefault(channel, ca.SX.sym(channel))
 
     def optional(self, channel: str, default: float) -> Expression:
-        return self.number(channel) if channel in self._available else ca.SX(default)
+        return self.number(channel) if channel in self.available else ca.SX(default)
 
     def used_by(self, expression: Expression) -> dict[str, Expression]:
         return {n: own for n, own in self.symbols.items() if n in self.kept or ca.depends_on(expression, own)}
@@ -197,7 +188,9 @@ def build_factor(
     """The expressions of one measurement; ``available`` are the channels of the records, ``environment`` the rest.
 
     ``unrolled`` has those of all points of a measurement of many, as if it had no points."""
-    symbols, values = _free_and_fixed(parameters)
+    # Each block's value is a number where it is fixed; nuisances are left out.
+    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
+    values |= {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
@@ -205,8 +198,10 @@ def build_factor(
     reading = _reading(name, measurement, records, states, local, unrolled)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
-    nuisance_names, nuisance_starts = _nuisance_starts(groups, states, local)
-    used = records.used_by(ca.vertcat(reading.everything, next_state, tools, nuisance_starts))
+    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
+    nuisance_starts = ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
+    margin = ca.SX(0, 1) if reading.margin is None else reading.margin
+    used = records.used_by(ca.vertcat(reading.outputs, reading.residual, margin, next_state, tools, nuisance_starts))
     own = [(arm_name, arms[arm_name.removesuffix(OTHER)]) for arm_name in measurement.arms]
     factor = Factor(
         name=name,
@@ -224,28 +219,12 @@ def build_factor(
         dimensions=residual_dimensions(measurement),
         margin=reading.margin,
         nuisance_starts=nuisance_starts,
-        nuisance_names=nuisance_names,
+        nuisance_names=tuple(n for n, entries in starts.items() for _ in range(entries.numel())),
         mean_weight=groups.mean_weight if groups else 1.0,
         springs=tuple(spring for _, arm in own for spring in arm.spring_names),
         joints=tuple((f"{a.name}.{j}{n.removeprefix(a.name)}", d) for n, a in own for j, d in a.commanded.items()),
     )
     return factor if reading.points is None else _of_points(factor, measurement, reading.points)
-
-
-def _free_and_fixed(parameters: Parameters) -> tuple[Expression, dict[str, Expression]]:
-    """Symbols of the free entries, and each block's value, a number where it is fixed; nuisances are left out."""
-    symbols, values = _symbols("values", [block for block in parameters.free if not block.nuisance])
-    fixed = {b.name: ca.SX(list(b.nominal)) for b in parameters.blocks if not (b.free or b.nuisance)}
-    return symbols, {**values, **fixed}
-
-
-def _nuisance_starts(
-    groups: GroupedMeasurement | None, states: Mapping[str, ArmState], local: Mapping[str, Expression]
-) -> tuple[tuple[str, ...], Expression]:
-    """Where a record alone has its group's parameters start: local names, one an entry, and entries."""
-    starts = {n: ca.SX(entries) for n, entries in groups.group_starts(states, local).items()} if groups else {}
-    names = tuple(n for n, entries in starts.items() for _ in range(entries.numel()))
-    return names, ca.densify(ca.vertcat(ca.SX(0, 1), *starts.values()))
 
 
 @dataclass(frozen=True)
@@ -258,10 +237,6 @@ class _Reading:
     margin: Expression = None
     points: Array | None = None
 
-    @property
-    def everything(self) -> Expression:
-        return ca.vertcat(self.outputs, self.residual, ca.SX(0, 1) if self.margin is None else self.margin)
-
 
 def _reading(
     name: str,
@@ -271,7 +246,6 @@ def _reading(
     local: Mapping[str, Expression],
     unrolled: bool,
 ) -> _Reading:
-    """Of the whole record, or of one point, whose numbers are channels, where there are points."""
     if unrolled or not isinstance(measurement, PointMeasurement):
         shown = _checked_outputs(measurement, measurement.outputs(states, local))
         measured = {c.name: records.optional(f"{name}.{c.name}", 0.0) for c in measurement.channels()}
@@ -280,14 +254,13 @@ def _reading(
     points = measurement.points
     point = ca.vertcat(*[records.number(f"{name}.{_POINT}{i}") for i in range(points.shape[1])])
     shown, own = measurement.point_outputs(states, local, point), [c.name for c in measurement.point_channels()]
-    is_read = any(records.has(f"{name}.{channel.name}") for channel in measurement.channels())
+    is_read = any(f"{name}.{channel.name}" in records.available for channel in measurement.channels())
     read = [records.number(f"{name}.{channel}") if is_read else ca.SX(0) for channel in own]
     margin = measurement.point_margin(states, local, point) if isinstance(measurement, LimitedView) else None
     return _Reading(tuple(own), shown, ca.vertcat(*read) - shown, margin, points)
 
 
 def _of_points(factor: Factor, measurement: Measurement, points: Array) -> Factor:
-    """The factor of records with all points, from that of one point, which it keeps."""
     name, rows, own = factor.name, factor.residual.numel(), factor.output_channels
     numbers = {f"{name}.{_POINT}{i}": i for i in range(points.shape[1])}
     shared = tuple(channel for channel in factor.channels if channel not in own and channel not in numbers)
@@ -351,7 +324,6 @@ def _arm_states(
 
 
 def _checked_outputs(measurement: Measurement, outputs: Any) -> dict[str, Expression]:
-    """The outputs of a measurement, each an expression (1 x 1), by local names of its channels."""
     channels = [channel.name for channel in measurement.channels()]
     expected = f"the expression of each channel by name: {', '.join(channels)}"
     with expecting(measurement.outputs, outputs, expected):

@@ -1,16 +1,10 @@
 """Compiled functions of one factor: residuals and Jacobians of many records in elastic equilibrium.
 
-Arrays are stored channel by channel, (channels x records).
+CasADi's interpreter, always there, or generated C evaluates blocks of records. Both give the same numbers, which is
+checked on a random block before a library is used. Arrays are stored channel by channel, (channels x records).
 
-What evaluates one factor on blocks of records: CasADi's interpreter, always there, or generated C.
-
-Both give the same numbers, which is checked on a random block before a library is used. Arrays are stored channel by
-channel, (channels x records).
-
-A factor's kernel over records in groups: values gathered for each group, Jacobians scattered back.
-
-One kernel serves any number of groups. Jacobians come a block of records at a time: memory does not grow with the
-records.
+Records may be in groups: one kernel serves any number of them, values are gathered for each and Jacobians scattered
+back, a block of records at a time, so that memory does not grow with the records.
 """
 
 import ctypes
@@ -52,8 +46,6 @@ class Backend(Protocol):
 
 
 class Interpreter(Backend):
-    """CasADi's interpreter over blocks of records."""
-
     name = "interpreted"
 
     def __init__(self, factor: Factor) -> None:
@@ -91,8 +83,6 @@ class Interpreter(Backend):
 
 
 class Compiled(Backend):
-    """The same functions in C, several records at once."""
-
     name = "compiled"
 
     def __init__(self, library: ctypes.CDLL) -> None:
@@ -234,7 +224,6 @@ class Kernel:
         shown[readings:] = narrow[own:, :: points.count]
 
     def require_held(self, values: Array, record: Array, state: Array) -> None:
-        """Refuse states in equilibrium that springs do not hold (NotConvergedError)."""
         self._over_points(self.evaluator.require_held, values, record, state)
 
     def nuisance_starts(self, values: Array, record: Array, state: Array, starts: Array) -> None:
@@ -300,7 +289,6 @@ def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto")
 
 
 def kernel_source(factor: Factor) -> str:
-    """The whole C file of a factor."""
     one = c_source.write_function(factor.pass_function, "pass", 1)
     two = c_source.write_function(factor.linearise_function, "linearise", 1)
     sizes = {
@@ -329,29 +317,22 @@ Block = tuple[Array, Array]  # Whitened, weighted Jacobian by the free entries (
 
 @dataclass(frozen=True)
 class Shown:
-    """What records show in equilibrium.
-
-    Attributes:
-        tools: base_T_tool of each of the measurement's arms, column by column: three axes, then the place
-            (arms x 4 x 3 x N, m).
-    """
+    """What records show in equilibrium."""
 
     outputs: Array  # what the instrument would read (n_o x N)
-    tools: Array
+    tools: Array  # base_T_tool of each arm, column by column: three axes, then the place (arms x 4 x 3 x N, m)
 
 
 @dataclass(frozen=True)
 class GroupedKernel:
     """A kernel, where its values come from, and where its Jacobian goes.
 
-    Results cover the records' whole width; their states are left in equilibrium.
-
-    Attributes:
-        entries: positions in a value vector, a row a group (groups x n_values); one row without groups, or while none
-            is known: then -1 stands where the spare values do.
+    Results cover the records' whole width; their states are left in equilibrium. ``entries`` are positions in a value
+    vector, a row a group (groups x n_values); one row without groups, or while none is known: then -1 stands where the
+    spare values do.
     """
 
-    kernel: Kernel  # of one factor
+    kernel: Kernel
     entries: Indices
     free: Indices  # positions among the free entries, -1 where an entry is held (the same shape)
     width: int  # how many free entries there are
@@ -359,7 +340,6 @@ class GroupedKernel:
 
     @property
     def _block_records(self) -> int:
-        """How many records a block has: fewer where each has many points."""
         points = 1 if self.kernel.points is None else self.kernel.points.count
         return max(LANES, BLOCK_RECORDS // points // LANES * LANES)
 
@@ -380,7 +360,6 @@ class GroupedKernel:
         return residual if records.present is None else np.where(records.present, residual, 0.0)
 
     def require_held(self, values: Array, records: FactorRecords) -> None:
-        """Refuse states in equilibrium that springs do not hold (NotConvergedError)."""
         self._evaluate(self.kernel.require_held, values, records)
 
     def channel_slopes(self, values: Array, records: FactorRecords, channels: Sequence[str]) -> Array:

@@ -58,10 +58,7 @@ __all__ = ["Compiled", "FactorRecords", "NormalEquations", "Problem", "triangula
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Half the squared whitened residuals and their Gauss-Newton model.
-
-    ``gradient`` (n) and ``hessian`` (n x n) are with respect to the free canonical entries.
-    """
+    """Half the squared whitened residuals, gradient (n) and Gauss-Newton Hessian by the free canonical entries."""
 
     cost: float
     gradient: Array
@@ -78,16 +75,6 @@ class ExtraRows:
     residual: Array
     jacobian: Array
 
-    @property
-    def cost(self) -> float:
-        return 0.5 * float(self.residual @ self.residual)
-
-    def added_to(self, equations: NormalEquations) -> NormalEquations:
-        by_residual, products = self.jacobian.T @ self.residual, self.jacobian.T @ self.jacobian
-        return NormalEquations(
-            equations.cost + self.cost, equations.gradient + by_residual, equations.hessian + products
-        )
-
 
 def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
     residual = np.concatenate([np.zeros(0), *(row.residual for row in rows)])
@@ -96,21 +83,16 @@ def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
 
 @dataclass(frozen=True)
 class TieFunction:
-    """One tie, ready to evaluate.
-
-    Attributes:
-        bend: of those numbers and a factor for each entry of the residual to the second derivative of their product.
-    """
+    """One tie, ready to evaluate."""
 
     groups: tuple[str, str]  # the keys
     entries: Indices  # positions in a value vector of what it holds together (n)
     noise: Array  # standard deviation of each entry of its residual
     function: ca.Function  # of those numbers to the residual (m or rad) and its Jacobian
-    bend: ca.Function
+    bend: ca.Function  # of these and a factor for each entry of the residual: second derivative of their product
 
     @classmethod
     def of(cls, owned: OwnedTie, parameters: Parameters) -> TieFunction:
-        """Built for the blocks of a problem."""
         entries: list[int] = []
         sides: tuple[dict[str, Expression], dict[str, Expression]] = ({}, {})
         for side, names in zip(sides, owned.names, strict=True):
@@ -126,11 +108,6 @@ class TieFunction:
         second = ca.densify(ca.hessian(ca.dot(factors, residual), symbols)[0])
         bend = ca.Function("tie_bend", [symbols, factors], [second])
         return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
-
-    @property
-    def sides(self) -> tuple[Indices, Indices]:
-        half = len(self.entries) // 2
-        return self.entries[:half], self.entries[half:]
 
     def residual(self, values: Array) -> Array:
         """What is left open at a value vector (m or rad)."""
@@ -244,7 +221,6 @@ class Compiled:
 
     @cached_property
     def grouped(self) -> tuple[GroupedKernel, ...]:
-        """Each kernel with where its values come from, and where its Jacobian goes."""
         return self.blueprint.grouped(self.kernels, self.parameters)
 
     @cached_property
@@ -254,7 +230,7 @@ class Compiled:
         A group held because no record belongs to it is not known: a tie to where it starts would be invented.
         """
         free, could = set(self.parameters.free_entries), set(self.blueprint.parameters.free_entries)
-        sides = [[set(side.tolist()) for side in tie.sides] for tie in self.known_ties]
+        sides = [[set(side.tolist()) for side in np.split(tie.entries, 2)] for tie in self.known_ties]
         return tuple(
             tie
             for tie, both in zip(self.known_ties, sides, strict=True)
@@ -337,7 +313,6 @@ class Problem:
         return replace(self, records=tuple(records))
 
     def with_record(self, number: int, records: FactorRecords) -> Self:
-        """With other records of one measurement."""
         return replace(self, records=(*self.records[:number], records, *self.records[number + 1 :]))
 
     def with_parameters(self, parameters: Parameters, tied: bool = True) -> Self:
@@ -408,7 +383,6 @@ class Problem:
 
     @property
     def pairs(self) -> Iterator[tuple[GroupedKernel, FactorRecords]]:
-        """Each measurement's kernel with its records."""
         return zip(self.grouped, self.records, strict=True)
 
     def equations(self) -> int:
@@ -428,11 +402,7 @@ class Problem:
         return here.taken_off(raw, there.states([r[:, :, None] for r in training.weighted_residuals(values)]))
 
     def require_held(self, values: Array) -> None:
-        """Refuse values at which springs do not hold the arm in every record.
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium, or one that is not stable.
-        """
+        """Refuse values at which a record has no elastic equilibrium, or none that is stable (NotConvergedError)."""
         self.residuals(values)
         for grouped, record in self.pairs:
             grouped.require_held(values, record)
@@ -440,7 +410,7 @@ class Problem:
     def cost(self, values: Array) -> float:
         """Half the weighted squared whitened residuals."""
         raw, shared = self.residuals(values), self.correlation
-        weighted = self._weighted(self.whitened(raw))
+        weighted = self.weighted_residuals(values, raw)
         if shared is not None:
             weighted = shared.independent([residual[:, :, None] for residual in weighted])
         total = sum(0.5 * float(np.sum(residual**2)) for residual in weighted)
@@ -450,11 +420,8 @@ class Problem:
                 total += 0.5 * float(np.sum((declared_ones @ share[: record.count]) ** 2))
         return total + sum(0.5 * float(np.sum((tie.residual(values) / tie.noise) ** 2)) for tie in self.ties)
 
-    def weighted_residuals(self, values: Array) -> tuple[Array, ...]:
-        """Residuals in units of their noise, times the roots of their weights, one (n_r x N) matrix a factor."""
-        return self._weighted(self.whitened_residuals(values))
-
-    def _weighted(self, whitened: Sequence[Array]) -> tuple[Array, ...]:
+    def weighted_residuals(self, values: Array, raw: Sequence[Array] | None = None) -> tuple[Array, ...]:
+        whitened = self.whitened(self.residuals(values) if raw is None else raw)
         pairs = zip(self.records, whitened, strict=True)
         return tuple(residual * np.sqrt(record.weight[: record.count]) for record, residual in pairs)
 
@@ -482,7 +449,10 @@ class Problem:
             cost += 0.5 * float(np.sum(residual**2))
             gradient = gradient + np.einsum("kvb,kb->v", jacobian, residual)
             hessian = hessian + sum((part @ part.T for part in jacobian), np.zeros((entries, entries)))
-        return self._extra(values).added_to(NormalEquations(cost, gradient, hessian))
+        extra = self._extra(values)
+        cost += 0.5 * float(extra.residual @ extra.residual)
+        gradient = gradient + extra.jacobian.T @ extra.residual
+        return NormalEquations(cost, gradient, hessian + extra.jacobian.T @ extra.jacobian)
 
     def triangular_factor(self, values: Array) -> Array:
         """R with R'R = J'J of the whitened residuals by coordinates: singular values keep their condition."""
@@ -630,7 +600,6 @@ class PosedProblem:
         return NormalEquations(moved.cost, moved.gradient, moved.hessian + curvature)
 
     def exact_hessian(self, x: Array) -> Array:
-        """The Hessian by ``x`` with the curvature of the residuals."""
         data = self.problem.normal_equations(self.values(x))
         exact = NormalEquations(0.0, data.gradient, self.problem.exact_hessian(self.values(x)))
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
@@ -645,7 +614,6 @@ class PosedProblem:
         return by_data.gradient + weighted @ self.coordinates(x), by_data.hessian + weighted @ by_prior
 
     def _coordinates_jacobian(self, x: Array) -> Array:
-        """d ``c`` / d ``x``."""
         jacobian = self.problem.parameters.coordinates_jacobian(x * self.scales)
         return jacobian * self.scales / self.coordinate_scales[:, None]
 
@@ -661,10 +629,8 @@ class PosedProblem:
 def require_numbers(problem: Problem, dataset: Dataset) -> None:
     """Refuse a problem whose residuals or derivatives are no numbers (NaN, infinite) at the nominal values.
 
-    Raises:
-        DataError: a record has no number where the measurement needs one.
-        PluginError: the displacement of an effect is none; with its method.
-        ProblemError: another residual or a derivative is none; with measurement and record, or parameters.
+    The error names the record that has no number where the measurement needs one, the method of the effect whose
+    displacement is none (PluginError), or measurement and record, or parameters.
     """
     nominal = problem.parameters.nominal()
     for kernel, own, residual in zip(problem.kernels, problem.records, problem.residuals(nominal), strict=True):

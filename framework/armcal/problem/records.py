@@ -30,25 +30,17 @@ _FEW_ROWS = 8  # Up to so many rows records are faster side by side than matrix 
 
 @dataclass(frozen=True)
 class FactorRecords:
-    """The records of one factor, padded to whole vectors; ``state`` is workspace that keeps equilibria warm.
-
-    ``weight`` (width) multiplies squared residuals. ``whitening`` (n_r x n_r x width) makes each record's residual
-    one of unit covariance; None stands for the factor's own noise, the same in every record. ``correlation`` is what
-    the records of all factors share, the same object in each; None where they are independent. ``group`` (width) is
-    the place of each record's group, -1 for none; None for a measurement without groups. ``applies`` (width) says
-    which records have what the measurement needs; the others weigh nothing. ``present`` (n_r x width) says which rows
-    of the residual are there where a record lacks points; the others are zero.
-    """
+    """The records of one factor, padded to whole vectors."""
 
     count: int
     record: Array
-    weight: Array
-    state: Array
-    whitening: Array | None = None
-    correlation: Correlation | None = None
-    group: Indices | None = None
-    applies: Mask | None = None
-    present: Mask | None = None
+    weight: Array  # multiplies squared residuals (width)
+    state: Array  # workspace that keeps equilibria warm
+    whitening: Array | None = None  # makes residuals of unit covariance (n_r x n_r x width); None: the declared noise
+    correlation: Correlation | None = None  # the same object in all factors; None where records are independent
+    group: Indices | None = None  # place of each record's group, -1 for none; None for a measurement without groups
+    applies: Mask | None = None  # which records have what the measurement needs; the others weigh nothing
+    present: Mask | None = None  # which rows of a residual are there (n_r x width); those of lacking points are zero
 
     def equations(self, rows: int) -> int:
         counted = self.weight != 0
@@ -92,12 +84,8 @@ def factor_records(
 ) -> FactorRecords:
     """A dataset as one factor reads it.
 
-    Args:
-        factor: of one measurement.
-        dataset: the records.
-        numbers: of each record's group (N); None without groups.
-        applies: which records are this measurement's (N); the others weigh nothing.
-        weights: multiply squared residuals (N).
+    ``numbers`` are of each record's group (N; None without groups), ``applies`` says which records are this
+    measurement's (the others weigh nothing), ``weights`` multiply squared residuals (N).
     """
     count = len(dataset)
     fill = _filled(np.arange(count, dtype=np.intp), count - 1)
@@ -129,7 +117,6 @@ def factor_records(
 
 
 def subset(records: Sequence[FactorRecords], chosen: Indices) -> tuple[FactorRecords, ...]:
-    """Some records of all."""
     fill = _filled(chosen, chosen[-1] if len(chosen) else 0)
     shared = correlation_of(records)
     correlation = None
@@ -197,11 +184,13 @@ def _whitening(factor: Factor, dataset: Dataset, fill: Indices) -> Array | None:
     if not any(stated):
         return None
     pairs = zip(stated, factor.noise, strict=True)
-    return by_deviation(np.array([dataset.column(c)[fill] if c else np.full(len(fill), sd) for c, sd in pairs]))
+    deviations = np.array([dataset.column(c)[fill] if c else np.full(len(fill), sd) for c, sd in pairs])
+    whitening = np.zeros((len(deviations), *deviations.shape))
+    whitening[np.arange(len(deviations)), np.arange(len(deviations))] = 1 / deviations
+    return whitening
 
 
 def declared(noise: Sequence[float]) -> Array:
-    """From standard deviations that hold for every record (n_r x n_r)."""
     return np.diag(1 / np.array(noise))
 
 
@@ -217,20 +206,8 @@ def noise_roots(factor: Factor, records: FactorRecords) -> Array:
     return np.asarray(np.linalg.inv(np.moveaxis(whitening_of(factor, records)[:, :, : records.count], 2, 0)))
 
 
-def by_deviation(deviations: Array) -> Array:
-    """From each record's own standard deviations (n_r x N), uncorrelated (n_r x n_r x N)."""
-    count = len(deviations)
-    whitening = np.zeros((count, *deviations.shape))
-    whitening[np.arange(count), np.arange(count)] = 1 / deviations
-    return whitening
-
-
 def by_covariance(covariances: Array) -> Array:
-    """From each record's covariance, given and returned as n_r x n_r x N.
-
-    Raises:
-        numpy.linalg.LinAlgError: one is not positive definite.
-    """
+    """From each record's covariance (n_r x n_r x N); LinAlgError if one is not positive definite."""
     lower = np.linalg.cholesky(np.moveaxis(covariances, 2, 0))
     identity = np.broadcast_to(np.eye(lower.shape[1]), lower.shape)
     return np.ascontiguousarray(np.moveaxis(np.linalg.solve(lower, identity), 0, 2))

@@ -93,14 +93,10 @@ class Tools:
 
 @dataclass(frozen=True)
 class Alignment:
-    """A pose of the base frame in the instrument's, and a place of the target.
+    """A pose of the base frame in the instrument's, and a place of the target."""
 
-    Attributes:
-        turn, shift: of the base frame (3 x 3; 3, m).
-    """
-
-    turn: Array
-    shift: Array
+    turn: Array  # of the base frame (3 x 3)
+    shift: Array  # of it (3, m)
     offset: Array  # by which the target is moved, in the tool's axes (3, m)
     left: float  # typical distance that is left (median, m)
 
@@ -117,11 +113,8 @@ class Alignment:
 def alignments(tools: Tools, measured: Array, basis: Array, turned: Array | None = None) -> tuple[Alignment, ...]:
     """Alignments that no step improves on, the best first; empty with too few records.
 
-    Args:
-        tools: of the nominal arm.
-        measured: positions in the instrument's frame (3 x N, m).
-        basis: directions in the tool's axes along which the target may be elsewhere (3 x k).
-        turned: measured rotations of a body on the tool (N x 3 x 3), if any.
+    ``measured`` are positions in the instrument's frame (3 x N, m), ``basis`` directions in the tool's axes along which
+    the target may be elsewhere (3 x k), ``turned`` measured rotations of a body on the tool (N x 3 x 3), if any.
     """
     if measured.shape[1] < FEWEST:
         return ()
@@ -244,9 +237,8 @@ def _shown(tools: Tools, turns: Array, shifts: Array, offsets: Array) -> Array:
 def _slopes(shown: Array, along: Array) -> Array:
     """How targets move (... x N x 3 x 6+n) by a turn about their middle, a shift, and along directions of the offset.
 
-    Args:
-        shown: where they are (... x N x 3, m).
-        along: those directions in the instrument's frame (... x N x 3 x n).
+    ``shown`` is where they are (... x N x 3, m), ``along`` those directions in the instrument's frame (... x N x 3 x
+    n).
     """
     arm = shown - shown.mean(axis=-2, keepdims=True)
     slopes = np.zeros((*shown.shape, 6 + along.shape[-1]))

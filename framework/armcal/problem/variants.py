@@ -4,17 +4,19 @@ Projected onto the model: what would have been measured had the values at hand b
 Where a Jacobian depends on measured numbers (a bearing, a contact, a closed chain) their errors turn undetermined
 directions into seemingly determined ones.
 
-With other readings: a residual need not be the readings less their predictions, one by one: it may have another order,
-sign or unit, or as few numbers as the rotation vector of a quaternion. What a residual means for the readings follows
-from its slope by them: the smallest change of the readings, each in the size that noise gives it, that changes the
-residual so.
+With other readings: a residual may have another order, sign or unit than its readings less their predictions, or as few
+numbers as the rotation vector of a quaternion. What it means for the readings follows from its slope by them: the
+smallest change of the readings, each in the size that noise gives it, that changes the residual so.
 
-Correlated by parameters that drift over a recording, which move slowly between records and are none of the arm. A
-drifting parameter is its value plus a stationary process whose correlation falls by e over a stated distance in
-recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), exactly so at the records' own places. It is no further
-parameter but a covariance of the residuals: the values found stay those of the arm at rest, their uncertainty counts
-the drift, and where records lie near others they determine the drift.
+Correlated by parameters that drift over a recording. A drifting parameter is its value plus a stationary process whose
+correlation falls by e over a stated distance in recorded order or time (Ornstein-Uhlenbeck [Rasmussen2006]), exactly so
+at the records' own places. It is a covariance of the residuals: the values found stay those of the arm at rest, their
+uncertainty counts the drift, and where records lie near others they determine the drift.
+
+How an arm stands in each record (``Motion``): how its joints would move the residuals, and what its sites carry.
 """
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -23,9 +25,10 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from armcal.arm.assembly import Arm
+from armcal.arm.assembly import Arm, SiteLoads, command_channels, site_loads
 from armcal.arm.evaluator import Evaluator
 from armcal.arm.pose_residual import CORRECTION, OF_TOOL, PoseResidual, Postures
+from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, ParameterBlock
@@ -33,7 +36,7 @@ from armcal.errors import DataError, ProblemError
 from armcal.measure.groups import OTHER
 from armcal.measure.instrument import LimitedView, spread_points
 from armcal.problem.factor import Factor
-from armcal.problem.kernel import GroupedKernel
+from armcal.problem.kernel import GroupedKernel, Kernel
 from armcal.problem.problem import Problem
 from armcal.problem.records import Correlation, FactorRecords, by_covariance, noise_roots, transformed, whitening_of
 
@@ -268,13 +271,10 @@ def corrected(problem: Problem, arm: Arm, corrections: Array) -> Problem:
 
 @dataclass(frozen=True)
 class Moved:
-    """How far corrections move the tool of an arm in each record (N; m): all of them, and parts of them alone.
-
-    Parts are ``tool`` and those joints that are corrected, by name.
-    """
+    """How far corrections move the tool of an arm in each record (N; m): all of them, and parts of them alone."""
 
     altogether: Array
-    parts: Mapping[str, Array]
+    parts: Mapping[str, Array]  # ``tool``, and those joints that are corrected, by name
 
 
 def moved_by(problem: Problem, values: Array, arm: Arm) -> Moved:
@@ -306,9 +306,7 @@ def sizes_of(covariances: Sequence[Array]) -> Array:
 
 
 def unexplained(
-    problem: Problem,
-    values: Array,
-    learned: Mapping[str, tuple[PoseResidual, Postures]] | None = None,
+    problem: Problem, values: Array, learned: Mapping[str, tuple[PoseResidual, Postures]] | None = None
 ) -> list[Array]:
     """Covariance of residuals by what learned pose residuals do not know (N x n_r x n_r a factor; SI).
 
@@ -396,15 +394,10 @@ def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset,
 
 @dataclass(frozen=True)
 class Chain:
-    """The places of records in a recording, in order, each once.
+    """The places of records in a recording, in order, each once."""
 
-    Attributes:
-        channels: what parameters drift over (``sequence``, or ``time`` in s).
-        places: of each node in each channel (n_k x channels).
-    """
-
-    channels: tuple[str, ...]
-    places: Array
+    channels: tuple[str, ...]  # what parameters drift over (``sequence``, or ``time`` in s)
+    places: Array  # of each node in each channel (n_k x channels)
 
     def nodes(self, dataset: Dataset) -> Indices:
         """Which node each record is at (N); all their places must be on the chain."""
@@ -419,7 +412,6 @@ class Chain:
 
 
 def chain(problem: Problem, *datasets: Dataset) -> Chain | None:
-    """The places of the records of a recording; None where nothing drifts."""
     drifting = _drifting(problem)
     if not drifting:
         return None
@@ -447,12 +439,7 @@ def _drifting(problem: Problem) -> list[tuple[ParameterBlock, Drift]]:
     return [(block, block.drift) for block in problem.parameters.free if block.drift is not None]
 
 
-def with_drift(
-    problem: Problem,
-    dataset: Dataset,
-    values: Array,
-    along: Chain | None = None,
-) -> Problem:
+def with_drift(problem: Problem, dataset: Dataset, values: Array, along: Chain | None = None) -> Problem:
     """The problem of a dataset with its records correlated as drifting parameters demand, by slopes at ``values``.
 
     ``along`` is the chain of a recording that has more records than these.
@@ -475,3 +462,100 @@ def with_drift(
     correlation = Correlation(tuple(slopes), tuple(raw), node, along.apart([drift for _, drift in drifting]))
     correlation = correlation.weighted([record.weight for record in problem.records])
     return problem.with_records([replace(record, correlation=correlation) for record in problem.records])
+
+
+ORDER_CHANNELS = ("sequence", "time")
+_STEP_M = 1e-3  # So small that a load that hangs there hardly stands elsewhere
+LOADS = ("turn_x", "turn_y", "turn_z", "gravity", "mass", "moment_x", "moment_y", "moment_z")
+"""Gravity turned about base axes (rad) and multiplied; a mass at the payload's centre (kg), its moments (kg m)."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Records as an arm goes through them."""
+
+    channels: tuple[str, ...]  # the command channels of all joints of all arms
+    slopes: tuple[Array, ...]  # raw residual by these, one (n_r x joints x N) array a factor (m/rad and the like)
+    loads: Mapping[str, SiteLoads]  # of each arm
+    by_load: tuple[Array, ...] = ()  # by ``LOADS`` (n_r x 8 x N a factor); empty if nothing gives way under loads
+
+    @classmethod
+    def of(cls, problem: Problem, values: Array, dataset: Dataset) -> Motion:
+        arms = problem.blueprint.arms
+        channels = tuple(command_channels(arms))
+        blocks = {b.name: values[problem.parameters.entries_of(b.name)] for b in problem.parameters.blocks}
+        acting, loads = np.array(list(_acting(problem, dataset).values())), {}
+        for name, arm in arms.items():
+            commands = arm.joint_commands([dataset.column(channel) for channel in arm.command_channels])
+            loads[name] = site_loads(arm, blocks, np.array(commands), acting)
+        slopes = problem.channel_slopes(values, channels)
+        elastic = any(len(record.state) for record in problem.records)
+        return cls(channels, slopes, loads, _by_load(problem, values, dataset) if elastic else ())
+
+    def subset(self, chosen: Indices) -> Motion:
+        loads = {
+            name: SiteLoads(load.moments[..., chosen], load.efforts[..., chosen], load.levers[..., chosen])
+            for name, load in self.loads.items()
+        }
+        by_load = tuple(slope[..., chosen] for slope in self.by_load)
+        return Motion(self.channels, tuple(slope[..., chosen] for slope in self.slopes), loads, by_load)
+
+    def along(self, channel: str) -> tuple[Array, ...]:
+        """Raw residual by one joint's command, one (n_r x N) array a factor."""
+        place = self.channels.index(channel)
+        return tuple(slope[:, place] for slope in self.slopes)
+
+
+def recorded_order(dataset: Dataset) -> Array:
+    """Where each record stands in the recording (N): its sequence number, else its time, else its row."""
+    for channel in ORDER_CHANNELS:
+        if dataset.has(channel) and np.all(np.isfinite(dataset.column(channel))):
+            return dataset.column(channel)
+    return np.arange(len(dataset), dtype=float)
+
+
+def recorded_position(dataset: Dataset) -> Indices:
+    """How many records were recorded before each (N)."""
+    position = np.empty(len(dataset), dtype=np.intp)
+    position[np.argsort(recorded_order(dataset), kind="stable")] = np.arange(len(dataset))
+    return position
+
+
+def _acting(problem: Problem, dataset: Dataset) -> dict[str, Array]:
+    """The loads of each record (N each), those of the environment where a record says nothing."""
+    return {
+        channel: dataset.column(channel) if dataset.has(channel) else np.full(len(dataset), default)
+        for channel, default in zip(LOAD_CHANNELS, problem.blueprint.environment.acting, strict=True)
+    }
+
+
+def _by_load(problem: Problem, values: Array, dataset: Dataset) -> tuple[Array, ...]:
+    """Raw residual by ``LOADS``, by a problem whose records all carry their loads; ``records`` are in equilibrium."""
+    plan, acting = problem.blueprint, _acting(problem, dataset)
+    loaded = replace(dataset, channels={**dataset.channels, **acting})
+    parts = (plan.arms, plan.measurements, problem.parameters, plan.environment, loaded)
+    other = Problem.build(*parts, "interpreted", plan.groups)
+
+    def slopes(of: Dataset) -> tuple[Array, ...]:
+        here = zip(other.of(of).records, problem.records, strict=True)
+        at_rest = [replace(factor_records, state=before.state.copy()) for factor_records, before in here]
+        whole = other.with_records(at_rest).channel_slopes(values, LOAD_CHANNELS[:4])
+        return tuple(map(_of_points, problem.kernels, other.kernels, whole))
+
+    g = np.array([acting[f"gravity_{axis}"] for axis in "xyz"])
+    ways = np.stack([np.cross(axis, g, axisb=0, axisc=0) for axis in np.eye(3)] + [g], axis=1)
+    bare = slopes(loaded)
+    pulled = [np.einsum("rgn,gkn->rkn", slope[:, :3], ways) for slope in bare]
+    hung = [[slope[:, 3:] for slope in bare]]
+    for axis in "xyz":  # what a mass does is linear in its centre
+        moved = {**loaded.channels, f"payload_{axis}": acting[f"payload_{axis}"] + _STEP_M}
+        shifted = slopes(replace(loaded, channels=moved))
+        hung.append([(own[:, 3:] - at) / _STEP_M for own, at in zip(shifted, hung[0], strict=True)])
+    return tuple(np.concatenate(own, axis=1) for own in zip(pulled, *hung, strict=True))
+
+
+def _of_points(kernel: Kernel, whole: Kernel, slopes: Array) -> Array:
+    if kernel.factor.points is None:
+        return slopes
+    every = {channel: row for row, channel in enumerate(whole.factor.output_channels)}
+    return slopes[[every[channel] for channel in kernel.factor.output_channels]]

@@ -25,8 +25,7 @@ from armcal.estimate.identifiability import (
     correlations,
     determined_in_words,
 )
-from armcal.estimate.uncertainty import Bootstrap
-from armcal.estimate.validation import ErrorSummary
+from armcal.estimate.validation import Bootstrap, ErrorSummary
 from armcal.plugins import PluginRegistry, said
 from armcal.report.document import Code, Document, Figure, Level, Marks, Panel, Part, Section, Table
 from armcal.report.numbers import NONE, common_decimals, count, decimals_for, fixed, plural, significant

@@ -30,8 +30,8 @@ from armcal.calibration.tool_expression import (
 from armcal.errors import ArmcalError, ConfigError, DataError, Location
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.measure.checks import noticed, records_of
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ReadRequest, RequestedChannel, requested_channels, surroundings
+from armcal.measure.tables import write_csv
 from armcal.plugins import PluginRegistry
 from armcal.run.plan import options_within
 

@@ -32,8 +32,7 @@ from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import Estimator, Progress, no_progress
 from armcal.estimate.robust import NoiseSettings, weighed
 from armcal.estimate.simulation import SimulationRequest, Simulator
-from armcal.estimate.uncertainty import BootstrapSettings
-from armcal.estimate.validation import Split, folds, hold_out, split_by_id, split_by_label
+from armcal.estimate.validation import BootstrapSettings, Split, folds, hold_out, split_by_id, split_by_label
 from armcal.measure.checks import noticed, records_of, require_conditions, warn_beyond_limits
 from armcal.measure.groups import grouped_instances, groups_of, pose_numbers, unmatched
 from armcal.measure.measurement import GroupedMeasurement

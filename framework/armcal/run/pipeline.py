@@ -24,8 +24,7 @@ from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import hopeless, mislabelled, restricted, started, typical_off
 from armcal.estimate.robust import WeighedFit, fit, held_fit, plain_fit
 from armcal.estimate.start import FAR, Start, aligned_start, with_proposals
-from armcal.estimate.uncertainty import Bootstrap, bootstrap
-from armcal.estimate.validation import cross_validate, error_unit
+from armcal.estimate.validation import Bootstrap, bootstrap, cross_validate, error_unit
 from armcal.io.parallel import Executor
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem, require_numbers

@@ -35,9 +35,16 @@ from armcal.estimate.simulation import approach_of, with_channels
 from armcal.measure.checks import TOLERANCE, own_limits, records_of, span_text
 from armcal.measure.groups import grouped_instances
 from armcal.measure.reader import Reader
-from armcal.planning.candidates import Candidates, Observability, efficiency, observability, value_of, whitened_rows
+from armcal.planning.candidates import (
+    Candidates,
+    Observability,
+    Task,
+    efficiency,
+    observability,
+    value_of,
+    whitened_rows,
+)
 from armcal.planning.exchange import Allowed, Plan, choose, refine
-from armcal.planning.relaxation import Task
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem, triangular
 from armcal.run.experiment import Experiment, PlanSettings, clearance_check, with_data

@@ -33,11 +33,10 @@ from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.polish import settled, untrained
 from armcal.estimate.prediction import residual_spread
-from armcal.estimate.uncertainty import Bootstrap
-from armcal.estimate.validation import ErrorSummary, Recording, Split, in_unit, summarise
+from armcal.estimate.validation import Bootstrap, ErrorSummary, Recording, Split, in_unit, summarise
 from armcal.io import plain_files
-from armcal.measure.csv_writer import csv_text
 from armcal.measure.reader import surroundings
+from armcal.measure.tables import csv_text
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, group_texts
@@ -79,7 +78,7 @@ def noise_content(fit: Fit, suspicious: Sequence[SuspiciousRecord]) -> dict[str,
     fitted, estimate = fit.fitted, fit.estimate
     content: dict[str, Any] = {"loss": fitted.loss}
     if fitted.loss != "none":
-        content["rounds"] = len(fitted.rounds)
+        content["rounds"] = fitted.rounds
         content["suspicious_records"] = [asdict(record) for record in suspicious]
     if fitted.components is not None:
         content["components"] = [finite(asdict(component)) for component in fitted.components.components]

@@ -26,22 +26,24 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import candidates, freeing, require_solvable
 from armcal.estimate.polish import restricted, untrained
 from armcal.estimate.robust import fit
-from armcal.estimate.uncertainty import BlockLength, automatic_block_length, standard_error_of_mean
 from armcal.estimate.validation import (
+    BlockLength,
     ErrorSummary,
     FitTask,
     JudgedFit,
     Split,
+    automatic_block_length,
     cross_validate,
     error_unit,
     errors_and_turns,
     fit_and_judge,
     folds,
     in_unit,
+    standard_error_of_mean,
     summarise,
 )
 from armcal.io.parallel import Executor
-from armcal.measure.csv_writer import csv_text
+from armcal.measure.tables import csv_text
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment, ExperimentSettings, ValidationSettings

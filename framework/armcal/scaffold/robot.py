@@ -30,9 +30,8 @@ from armcal.estimate.estimator import Progress, no_progress
 from armcal.estimate.identifiability import MinimalSet, minimal_set
 from armcal.estimate.simulation import measured_without_noise
 from armcal.measure.checks import records_of
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.reader import ENVIRONMENT, ReadRequest, RequestedChannel
-from armcal.measure.tables import spellings
+from armcal.measure.tables import spellings, write_csv
 from armcal.plugins import PluginRegistry
 from armcal.problem.variants import factor_at_zero
 from armcal.report.numbers import plural

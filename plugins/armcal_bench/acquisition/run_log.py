@@ -15,7 +15,7 @@ from armcal.devices.device import DeviceIdentity
 from armcal.errors import ConfigError
 from armcal.io.journal import JOURNAL_FILES, Entry, Journal, JournalFailedError, JournalFullError
 from armcal.io.plain_files import write_whole
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 from typing_extensions import override

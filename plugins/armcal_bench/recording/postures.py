@@ -16,9 +16,9 @@ from armcal.base.units import display_unit, to_unit
 from armcal.devices.live import JointSample
 from armcal.errors import DataError
 from armcal.io.journal import JOURNAL_FILES, Journal
-from armcal.measure.csv_writer import write_csv
 from armcal.measure.groups import record_keys
 from armcal.measure.measurement import GroupedMeasurement, Measurement, NamesGroups
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
 

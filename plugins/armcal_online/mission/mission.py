@@ -27,7 +27,7 @@ from armcal.errors import ConfigError, NotConvergedError
 from armcal.estimate.estimator import Progress, no_progress
 from armcal.io.lines import StandardOutput
 from armcal.io.plain_files import reserved, writing
-from armcal.measure.csv_writer import csv_text, write_csv
+from armcal.measure.tables import csv_text, write_csv
 from armcal.plugins import PluginRegistry, discover
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment

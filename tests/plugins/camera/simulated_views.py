@@ -14,7 +14,7 @@ from armcal.arm.model import forward
 from armcal.base.arrays import Array
 from armcal.base.quaternions import quaternion_of
 from armcal.estimate.estimator import Estimate
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import RunContext, Stopwatch, fitted, prepare
 from armcal_camera.images_reader import View

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import armcal
 import numpy as np
-from armcal.problem.motion import Motion
-from armcal.problem.variants import FEW_POINTS, with_few_points
+from armcal.problem.variants import FEW_POINTS, Motion, with_few_points
 from armcal.run.pipeline import Stopwatch, assemble
 
 CONFIG = Path(__file__).parents[3] / "configs" / "so101" / "camera.yaml"

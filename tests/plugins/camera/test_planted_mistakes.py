@@ -10,7 +10,7 @@ import yaml
 from armcal.base.dataset import Dataset
 from armcal.errors import ProblemError
 from armcal.estimate.identifiability import deviations
-from armcal.measure.csv_writer import write_csv
+from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import Stopwatch, assemble, calibrate
 from scipy.spatial.transform import Rotation
