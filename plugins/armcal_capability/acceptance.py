@@ -43,7 +43,7 @@ from armcal.run.experiment import Experiment, with_data
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from armcal_capability.survey import examined_arm
+from armcal_capability.capability import examined_arm
 
 OURS = ("acceptance.json", "acceptance.csv")
 ISO_CYCLES = 30  # visits to a pose that the standard asks for

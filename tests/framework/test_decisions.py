@@ -12,9 +12,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from armcal.estimate.online import Gaussian
-from armcal_online.sources import Incoming
-from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.decisions import (
+from armcal_online.belief import Belief
+from armcal_online.decisions import (
     KINDS,
     LEVEL_ADVICE,
     LEVELS,
@@ -25,15 +24,15 @@ from armcal_online.tracking.decisions import (
     spoken_time,
     sure,
 )
-from armcal_online.tracking.events import decided, last_good, record_name
-from armcal_online.tracking.hypotheses import Kind
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.state import REMEMBERED, Arrival, Health, State, remembering, troubled
+from armcal_online.hypotheses import Kind
+from armcal_online.recalibrator import Recalibrator, decided, last_good, record_name
+from armcal_online.sources import Incoming
+from armcal_online.state import REMEMBERED, Arrival, Health, State, remembering, troubled
 from online_arm import World, begun, predicted, random_poses, settings, told
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "decisions.md"
-SOURCES = ROOT / "plugins" / "armcal_online" / "tracking"
+SOURCES = ROOT / "plugins" / "armcal_online"
 NAMES = ("subject", "candidates", "calm", "good")
 SLIP = math.radians(6.0)
 

@@ -14,8 +14,7 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal_online.tracking.belief import nearest_semidefinite
-from armcal_online.tracking.observer import OneRecord
+from armcal_online.belief import OneRecord, nearest_semidefinite
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
 COMPLIANCE = 0.05

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from armcal.estimate.online import log_density
 from armcal_online.sources import Incoming
-from armcal_online.tracking.window_evidence import JointDensity, log_density_of_outlier
+from armcal_online.window_evidence import JointDensity, log_density_of_outlier
 from online_arm import AXES, World, begun, told
 from scipy.stats import multivariate_normal
 

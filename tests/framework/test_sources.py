@@ -16,7 +16,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import DataError, InputError
 from armcal.io.lines import LineCutter
-from armcal_online.running.loop import MAX_FILES, Progress
+from armcal_online.loop import MAX_FILES, Progress
 from armcal_online.sources import Incoming, Lines, Place, RowParser, Source, open_source
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from fake_recalibrator import HEADER, request, row
@@ -216,7 +216,7 @@ def test_a_file_is_gone_on_with_after_the_last_row_that_was_taken(tmp_path: Path
         assert incoming is not None
         progress.take(incoming, sequence)
     second = Lines(rows(), path)
-    second.resume(Progress.from_dict(json.loads(json.dumps(asdict(progress)))).positions)
+    second.resume(Progress(**json.loads(json.dumps(asdict(progress)))).positions)
     both = [*(r for r in found if r is not None), *everything(second)]
     assert [r.record_id for r in both if not r.fault] == [f"p{i}" for i in range(1, 9)] and len(both) == 9
 

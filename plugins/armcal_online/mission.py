@@ -37,12 +37,12 @@ from armcal.run.result import calibration_content
 from pydantic import Field, model_validator
 from typing_extensions import override
 
-from armcal_online.mission.simulator import DAY_S, HOUR_S, Event, Mission, MissionOfDays, with_payload
-from armcal_online.running.session import Setup, opened
+from armcal_online.commands import header_of, opened
+from armcal_online.mission_simulator import DAY_S, HOUR_S, Event, Mission, MissionOfDays, with_payload
+from armcal_online.recalibrator import Recalibrator
+from armcal_online.settings import SECTION as RECALIBRATE
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming, Lines, RowParser
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import SECTION as RECALIBRATE
-from armcal_online.tracking.settings import RecalibrateSettings
 
 SECTION = "mission"
 BENCH, CALIBRATION, RECORDS, RECALIBRATION = "bench.csv", "calibration.yaml", "records.csv", "recalibration"
@@ -173,8 +173,9 @@ def recalibrated(plan: MissionPlan, mission: Mission, calibration: Path, folder:
     for cut in (*np.searchsorted(mission.times, mission.power_cuts).tolist(), np.inf):
         session = Recalibrator(Calibration.load(calibration, registry), every, registry)
         source = CutSource(folder / RECORDS, RowParser(session.request, settings.columns), cut)
-        setup = Setup(folder / RECALIBRATION, calibration, StandardOutput(stream))
-        with suppress(PowerCutError), opened(setup, session, source) as loop:
+        kept = folder / RECALIBRATION
+        going = opened(kept, header_of(kept, calibration, session), session, source, StandardOutput(stream))
+        with suppress(PowerCutError), going as loop:
             loop.run()
             if not source.ended:
                 raise KeyboardInterrupt

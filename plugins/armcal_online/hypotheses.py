@@ -36,9 +36,8 @@ from armcal.errors import ArmcalError
 from armcal.estimate.online import Gaussian, Linearised
 from armcal.problem.problem import Problem
 
-from armcal_online.tracking.belief import Belief, ProcessNoise, StateSpace
-from armcal_online.tracking.observer import JointNoise, Observer, Reading
-from armcal_online.tracking.settings import ChangeSettings
+from armcal_online.belief import Belief, JointNoise, Observer, ProcessNoise, Reading, StateSpace
+from armcal_online.settings import ChangeSettings
 
 CauseKind = Literal["payload_changed", "gravity_tilted", "link_bent"]
 CAUSES: tuple[CauseKind, ...] = get_args(CauseKind)

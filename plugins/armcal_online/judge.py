@@ -8,9 +8,9 @@ import numpy as np
 from armcal.estimate.online import Linearised
 from scipy.special import logsumexp
 
-from armcal_online.tracking.belief import Belief, StateSpace
-from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of, per_cent
-from armcal_online.tracking.hypotheses import (
+from armcal_online.belief import Belief, StateSpace
+from armcal_online.decisions import EXPLAINED, Decision, log_odds_of, per_cent
+from armcal_online.hypotheses import (
     CAUSES,
     GRADUAL,
     LEAST_RECORDS,
@@ -22,9 +22,9 @@ from armcal_online.tracking.hypotheses import (
     pairs,
     spoken,
 )
-from armcal_online.tracking.settings import ChangeSettings, RecalibrateSettings
-from armcal_online.tracking.state import Health, State, improbability, many_outliers, nis_limit
-from armcal_online.tracking.window_evidence import HypothesisFilter, Size, rate_of, size_of
+from armcal_online.settings import ChangeSettings, RecalibrateSettings
+from armcal_online.state import Health, State, improbability, many_outliers, nis_limit
+from armcal_online.window_evidence import HypothesisFilter, Size, rate_of, size_of
 
 
 def change_decision(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:

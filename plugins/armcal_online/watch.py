@@ -23,8 +23,7 @@ from armcal.base.config_text import as_line
 from armcal.cli.console import say
 from armcal.errors import ArmcalError, InputError, Location
 
-from armcal_online.running.situation import EARLIER, EVENTS, present
-from armcal_online.tracking.decisions import spoken_time
+from armcal_online.decisions import EARLIER, EVENTS, present, spoken_time
 
 DEFAULT_PORT = 8642
 _HOST = "127.0.0.1"
@@ -120,7 +119,7 @@ def newest_events(folder: Path) -> dict[str, list[dict[str, Any]]]:
 @lru_cache
 def page() -> tuple[bytes, str]:
     """The page, and the policy that lets no script and style in but its own."""
-    html = resources.files("armcal_online.commands").joinpath("watch.html").read_text(encoding="utf-8")
+    html = resources.files("armcal_online").joinpath("watch.html").read_text(encoding="utf-8")
     (style,), (script,) = (re.findall(f"<{tag}>(.*?)</{tag}>", html, re.DOTALL) for tag in ("style", "script"))
     own = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
     policy = f"default-src 'none'; style-src 'sha256-{own[0]}'; script-src 'sha256-{own[1]}'; connect-src 'self'; "

@@ -19,10 +19,9 @@ from armcal.estimate.validation import error_dimension, error_unit
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dposv
 
-from armcal_online.tracking.belief import Belief, ProcessNoise, StateSpace
-from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, Recent, Steps
-from armcal_online.tracking.observer import Observer, linearised
-from armcal_online.tracking.settings import OutlierSettings
+from armcal_online.belief import Belief, Observer, ProcessNoise, StateSpace, linearised
+from armcal_online.hypotheses import Candidate, Explanation, Hypothesis, Recent, Steps
+from armcal_online.settings import OutlierSettings
 
 SHOWN = {
     "angle": ("size_deg", "deg", math.degrees(1.0)),

@@ -33,9 +33,16 @@ from armcal.errors import ConfigError, InputError, Location
 from armcal.io.plain_files import write_whole
 from typing_extensions import override
 
-from armcal_simulation.bench.servo_model import JointServo
-from armcal_simulation.bench.tracker import SimulatedTracker
-from armcal_simulation.bench.world import ALL, WALL_AT_START, BenchTruthSettings, BenchWorld, FaultRequest, TrackedArm
+from armcal_simulation.servos import JointServo
+from armcal_simulation.world import (
+    ALL,
+    WALL_AT_START,
+    BenchTruthSettings,
+    BenchWorld,
+    FaultRequest,
+    SimulatedTracker,
+    TrackedArm,
+)
 
 EXAMPLE_SERVOS = Path(__file__).with_name("example_servos.yaml")
 TICK_S = 0.02  # of the board's watchdog
