@@ -114,8 +114,6 @@ class CapabilitySettings(Settings):
 
 @dataclass(frozen=True)
 class Design:
-    """One arm whose parameters are numbers."""
-
     expression: ToolExpression
     limits: Array  # of its commands (joints x 2; rad or m)
     clearance: ClearanceCheck | None
@@ -123,16 +121,12 @@ class Design:
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be surveyed, and how; without a list of designs the arm as it is, by the name of its file."""
-
     settings: CapabilitySettings
     designs: Mapping[str, Design]
 
 
 @dataclass(frozen=True)
 class Corrections:
-    """How a real arm differs from its description: its stated parameters, and the corrected ones."""
-
     stated: Parameters
     corrected: Parameters
 
@@ -223,7 +217,6 @@ def _design(source: ConfigSource, registry: PluginRegistry, path: Path, correcti
 
 
 def _limits(arm: Arm, system: System, source: ConfigSource, path: Path) -> tuple[Array, ClearanceCheck | None]:
-    """Limits (joints x 2), those that are stated or the model's own; and clearance."""
     settings, check = PlanSettings(), None
     if source.data.get("plan") is not None:
         settings = validate(PlanSettings, source, ("plan",))
@@ -241,7 +234,6 @@ def _limits(arm: Arm, system: System, source: ConfigSource, path: Path) -> tuple
 
 
 def _with_rules(source: ConfigSource, rules: ConfigSource) -> ConfigSource:
-    """A configuration with the sections ``capability`` and ``plan`` of another."""
     data = {**source.data, **{key: rules.data[key] for key in _RULES if key in rules.data}}
     marks = {**source.marks, **{place: at for place, at in rules.marks.items() if place and place[0] in _RULES}}
     return replace(source, data=data, marks=marks)
@@ -293,7 +285,6 @@ class MechanicsFunction:
         )
 
     def tools(self, commands: Array) -> tuple[Array, Mask]:
-        """Tools (N x 4 x 4), and which have an equilibrium."""
         standing = self._equilibrium(self.records(commands))
         return standing.base_T_tool, np.asarray(standing.settled, dtype=bool)
 
@@ -304,7 +295,6 @@ class MechanicsFunction:
         return np.asarray(self._equilibrium(record, states).base_T_tool[:, :3, 3].T)
 
     def records(self, commands: Array) -> Array:
-        """Records (channels x N) of commands (n x N) under the load."""
         record = np.repeat(self._record[:, None], commands.shape[1], axis=1)
         record[: self._joints] = commands
         return record
@@ -324,7 +314,6 @@ class Pointing:
         return cls("xyz".index(settings.axis), along / np.linalg.norm(along), settings.within)
 
     def angles(self, rotations: Array) -> Array:
-        """Between the tool's axis and the direction (N; rad), of base_R_tool (3 x 3 x N)."""
         axis = rotations[:, self.axis]
         across = np.linalg.norm(np.cross(axis.T, self.along), axis=1)
         return np.asarray(np.arctan2(across, axis.T @ self.along))
@@ -332,8 +321,6 @@ class Pointing:
 
 @dataclass(frozen=True)
 class AreaMap:
-    """An area, cell by cell."""
-
     centres: Array  # cells x 3; m, base frame
     counts: NDArray[np.int64]  # postures found that bring the tool to the centre
     orientations: NDArray[np.int64]  # along how many of ORIENTATIONS the tool's axis can point there
@@ -347,8 +334,6 @@ class AreaMap:
 
 @dataclass(frozen=True)
 class Survey:
-    """What one arm can do in areas."""
-
     drawn: int  # postures
     clear: int  # of which keep their clearance
     settled: int  # of which have an elastic equilibrium
@@ -356,12 +341,6 @@ class Survey:
 
 
 def survey(design: Design, settings: CapabilitySettings) -> Survey:
-    """Survey an arm.
-
-    Raises:
-        ConfigError: ``holding`` names a joint that the arm has not.
-        ProblemError: no posture keeps its clearance, or none has an equilibrium; or there would be too many cells.
-    """
     for name, area in settings.areas.items():
         cells = float(np.prod(np.ceil(np.subtract(area.high, area.low) / settings.voxel)))
         _require(
@@ -383,10 +362,7 @@ def cells_of(area: AreaSettings, size: float) -> Array:
 
 
 def spread(limits: Array, count: int, seed: int) -> Array:
-    """So many commands (joints x count) between limits (joints x 2), by a scrambled Sobol sequence.
-
-    More of them begin with the same ones; the same seed gives the same.
-    """
+    """By a scrambled Sobol sequence (joints x count): more begin with the same ones, a seed gives the same again."""
     from scipy.stats import qmc
 
     drawn = qmc.Sobol(len(limits), rng=seed).random_base2(max(0, math.ceil(math.log2(count))))[:count]
@@ -406,8 +382,6 @@ def quantities(function: MechanicsFunction, commands: Array, mechanics: Mechanic
 
 
 class AreaSearch:
-    """Searches areas for one arm, from postures spread over joint space."""
-
     def __init__(self, design: Design, settings: CapabilitySettings, choice: EvaluatorChoice = "auto") -> None:
         self._design, self._settings = design, settings
         names = design.expression.arm.joint_names
@@ -474,7 +448,6 @@ class AreaSearch:
         return np.asarray(cKDTree(where).query(targets, k=most)[1]).reshape(len(centres), most)
 
     def _found(self, centres: Array, starts: Indices, pointing: Pointing | None) -> tuple[Indices, Array]:
-        """Commands (n x found) that bring the tool to centres from some of ``starts`` (cells x k), and their cells."""
         cell = np.repeat(np.arange(len(centres)), starts.shape[1])
         commands = np.asarray(self._commands[:, starts.reshape(-1)])
         commands, arrived = reach_for(self.solvers, self.function.records(commands), centres[cell].T, pointing)
@@ -560,7 +533,6 @@ def capability(console: Console, source: Path, out: Path, settings: Path | None,
 
 
 def summaries(surveys: Mapping[str, Survey]) -> dict[str, dict[str, Any]]:
-    """Of each design its score and areas; quantities over the cells that all designs reach."""
     content: dict[str, dict[str, Any]] = {}
     for design, own in surveys.items():
         areas = dict[str, dict[str, Any]]()
@@ -606,7 +578,6 @@ def _table(designs: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _areas_text(surveys: Mapping[str, Survey]) -> str:
-    """The areas of all designs: a row a cell."""
     headings: list[str] = []
     rows: list[tuple[Any, ...]] = []
     for design, own in surveys.items():

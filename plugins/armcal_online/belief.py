@@ -55,12 +55,10 @@ class StateSpace:
 
     @cached_property
     def scales(self) -> Array:
-        """The typical scale of each coordinate (n)."""
         return self.parameters.scales()
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the coordinates (n)."""
         return self.parameters.coordinate_names
 
     @cached_property
@@ -126,7 +124,6 @@ class StateSpace:
         return whole * self.scales
 
     def of_entries(self, values: Array, covariance: Array) -> Array:
-        """A covariance of the free entries as one of scaled coordinates (n x n)."""
         chain = self.chain(values)
         if chain is None:
             return np.asarray(covariance / np.outer(self.scales, self.scales))
@@ -166,7 +163,6 @@ class StateSpace:
 
     @cached_property
     def _matrices(self) -> Indices:
-        """Of semidefinite blocks, the places of their entries in a value vector (blocks x 6)."""
         return _positions(entries for entries, _ in self.cones).reshape(-1, 6)
 
 
@@ -212,7 +208,6 @@ class Belief:
         return Belief(origin, Gaussian(mean, self.gaussian.covariance))
 
     def widened(self, count: int, factor: float) -> Belief:
-        """The belief with the standard deviations of its first ``count`` coordinates multiplied."""
         scale = np.ones(len(self.gaussian.mean))
         scale[:count] = factor
         return Belief(self.origin, Gaussian(self.gaussian.mean, self.gaussian.covariance * scale[:, None] * scale))
@@ -268,8 +263,6 @@ def _nearest_in_cones(root: Array, given: Array, ends: tuple[Array, Array], scal
 
 @dataclass(frozen=True)
 class GaussMarkovState:
-    """One process."""
-
     name: str  # for people
     over: float  # the distance over which it forgets, in units of the channel
     channel: str  # ``sequence`` (places in a recording), ``record`` (one by one) or ``time`` (s)
@@ -281,8 +274,6 @@ class GaussMarkovState:
 
 @dataclass(frozen=True)
 class GaussMarkovStates:
-    """All of them (m)."""
-
     states: tuple[GaussMarkovState, ...] = ()
 
     def __len__(self) -> int:
@@ -316,8 +307,6 @@ def shared_error(instance: str, covariance: Array, over: float, channel: str) ->
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """How a belief widens between records."""
-
     rates: Array  # variance that each parameter's scaled coordinate gains in a second (n)
     gauss_markov: GaussMarkovStates  # the states beside the parameters
 
@@ -337,15 +326,7 @@ class ProcessNoise:
 
 
 def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
-    """Variance that each free coordinate gains, in its scaled unit squared per s (n).
-
-    Args:
-        parameters: with the free ones.
-        stated: by glob, a standard deviation and the time in which it comes about: ``0.05 deg in 30 d``.
-
-    Raises:
-        ConfigError: a glob matches nothing, or nothing free; a text is no such rate.
-    """
+    """Variance that each free coordinate gains, in its scaled unit squared per s (n)."""
     rates = {block.name: 0.0 for block in parameters.free}
     for glob, text in stated.items():
         where = Location(f"process_noise.{glob}")
@@ -405,12 +386,6 @@ class OneRecord:
             self._evaluate = backend.prepared(*arrays)
 
     def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
-        """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium.
-
-        Args:
-            values: of the kernel (n_v).
-            record: its channels (n_c).
-        """
         residuals, jacobians = self.linearise_several(values, record[None])
         return residuals[0], jacobians[0]
 
@@ -440,8 +415,6 @@ JointNoise = tuple[Array | None, ...]
 
 @dataclass(frozen=True)
 class Reading:
-    """One record as one measurement reads it."""
-
     factor: int  # which of the problem's measurements
     record: Array  # its channels in the kernel's order (n_c)
     group: int  # the place of its group; 0 without groups
@@ -451,16 +424,7 @@ class Reading:
 class Observer:
     """Makes observations of records, for one problem.
 
-    Args:
-        problem: compiled.
-        space: of its free parameters.
-        gauss_markov: the states beside them.
-        noisy: drifts that count as noise: each record has its own.
-        noise: covariance of each measurement's error (n_r x n_r), where a record does not state its own.
-        freedoms: degrees of freedom with which each of these is known.
-        defaults: channels that a record may leave out, and what then holds.
-        unfound: parameters of groups that the calibration did not find: a record there determines nothing.
-        joint_scale: of the joints' own noise, against what each arm states.
+    ``noisy`` are drifts that count as noise: each record has its own. Of ``unfound`` groups records determine nothing.
     """
 
     def __init__(
@@ -534,11 +498,6 @@ class Observer:
         return min(self._freedoms[reading.factor] for reading in readings)
 
     def joint_noise(self, values: Array, readings: tuple[Reading, ...]) -> JointNoise:
-        """What noise of the joints' own readings adds at values.
-
-        Raises:
-            NotConvergedError: no equilibrium there.
-        """
         if not self._noisy_joints:
             return (None,) * len(readings)
         names, added = tuple(self._noisy_joints), []
@@ -558,20 +517,12 @@ class Observer:
         return kernel, grouped.values(values, reading.group), record, np.zeros((kernel.factor.state.numel(), LANES))
 
     def linearise(self, values: Array, reading: Reading) -> tuple[Array, Array]:
-        """Innovation (n_r) and the prediction's derivative by scaled coordinates (n_r x n) at values in their domains.
-
-        Raises:
-            NotConvergedError: no equilibrium there.
-        """
+        """Innovation (n_r) and the prediction's derivative by scaled coordinates (n_r x n), within the domains."""
         innovations, slopes = self.linearise_several(values, [reading])
         return innovations[0], slopes[0]
 
     def linearise_several(self, values: Array, readings: Sequence[Reading]) -> tuple[Array, Array]:
-        """The same of readings of one factor (k x n_r, k x n_r x n).
-
-        Raises:
-            NotConvergedError: no equilibrium there.
-        """
+        """The same of readings of one factor (k x n_r, k x n_r x n)."""
         factor, count = readings[0].factor, len(readings)
         grouped, evaluator, entries = self.problem.grouped[factor], self._one_record[factor], self._plain[factor]
         records = np.array([reading.record for reading in readings])
@@ -630,7 +581,6 @@ class RecordObservation(Observation):
         return inside, self.base[:n] if (inside == values).all() else self.base[:n] + space.between(inside, values)
 
     def _assembled(self, point: Array, outside: Array, evaluated: Sequence[tuple[Array, Array]]) -> Linearised:
-        """What the readings' innovations and slopes where they are evaluated make of a point."""
         observer = self.observer
         beside = point[len(observer.space.scales) :]
         which, coordinate, size = observer.drifts
@@ -659,11 +609,7 @@ class RecordObservation(Observation):
 
 
 def linearised(observations: Sequence[RecordObservation], points: Sequence[Array]) -> list[Linearised]:
-    """Records of one belief, each at a point; where these are the same values, they are evaluated together.
-
-    Raises:
-        NotConvergedError: no equilibrium there.
-    """
+    """Records of one belief, each at a point; where these are the same values, they are evaluated together."""
     distinct = {id(point): point for point in points}
     known = {key: observations[0]._place(point) for key, point in distinct.items()}
     places = [known[id(point)] for point in points]

@@ -127,7 +127,6 @@ def _target(values: tuple[str, ...]) -> int | str:
 
 
 def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> dict[str, Any]:
-    """The reply of the recalibration that runs in a folder: ``ok``, and the answer or an ``error``."""
     where = Location(str(folder / SOCKET))
     try:
         with JsonClient(folder / SOCKET, timeout_s) as client:
@@ -144,14 +143,7 @@ def ask(folder: Path, request: Mapping[str, Any], timeout_s: float = 30.0) -> di
 def opened(
     folder: Path, header: Mapping[str, Any], session: Recalibrator, source: Source, stream: StandardOutput
 ) -> Iterator[Recalibration]:
-    """Begin in a new folder, or go on in one: its newest checkpoint, the entries after it, the source after these.
-
-    The source is closed in the end.
-
-    Raises:
-        InputError: the folder is another's, is in use, or belongs to another calibration or other settings.
-        DataError: the journal is damaged.
-    """
+    """Begin in a new folder, or go on in one: its newest checkpoint, the entries after it, the source after these."""
     with ExitStack() as stack:
         stack.callback(source.close)
         journal = stack.enter_context(Journal(folder, header, session.settings.journal.total_bytes))

@@ -30,11 +30,10 @@ LEVELS: tuple[Level, ...] = get_args(Level)  # from the best to the worst
 
 @dataclass(frozen=True)
 class DecisionKind:
-    """One kind of decision.
+    """``do`` and ``confirm`` are whole sentences for somebody who cannot reach the arm.
 
-    ``do`` and ``confirm`` are whole sentences for somebody who cannot reach the arm. They may hold ``{subject}`` (the
-    joint, instrument or link), ``{candidates}`` (all that it may be), ``{calm}`` (how many records in a row without
-    trouble improve the level) and ``{good}`` (where to roll back to).
+    They may hold ``{subject}`` (the joint, instrument or link), ``{candidates}``, ``{calm}`` (how many records in a row
+    without trouble improve the level) and ``{good}`` (where to roll back to).
     """
 
     do: str  # what to do now
@@ -181,8 +180,6 @@ LEVEL_ADVICE: Mapping[Level, str] = {
 
 @dataclass(frozen=True)
 class Decision:
-    """Something that was decided."""
-
     kind: str  # its name in ``KINDS``
     what: str  # what happened, a clause without a full stop
     why: str  # the evidence, a clause without a full stop
@@ -215,14 +212,12 @@ def sure(log_odds: float) -> str:
 
 
 def sure_to(known: float) -> str:
-    """How sure, in words; never ``100 %``."""
     if known > 99.9:
         return "More than 99.9 % sure"
     return f"{known:.1f} % sure" if known > 99 else f"{known:.0f} % sure"
 
 
 def advice(kind: str, names: Mapping[str, Any]) -> dict[str, str]:
-    """``do`` and ``confirm`` of a decision, with the names of its joints, instrument and records."""
     texts = KINDS[kind]
     return {"do": texts.do.format_map(names), "confirm": texts.confirm.format_map(names)}
 
@@ -264,7 +259,6 @@ class Situation:
 
     @classmethod
     def recovered(cls, folder: Path) -> Situation:
-        """As the events in a folder leave it; what cannot be read there is passed over."""
         known = cls()
         for name in filter(lambda name: (folder / name).is_file(), (EARLIER, EVENTS)):
             with suppress(OSError), (folder / name).open(encoding="utf-8", errors="replace") as lines:
@@ -291,12 +285,9 @@ class Situation:
                 self._decision = event if kind == "decision" else self._decision
 
     def first_screen(self, level: str, good: Event | None, folder: Path) -> dict[str, Any]:
-        """The first screen.
+        """The first screen; ``off_mm`` is now, from ``off_of`` readings, ``off_before_mm`` before the last decision.
 
-        Returns:
-            ``do``, ``what`` (with how sure that is), ``confirm``; ``earlier``, the last decision where none matters
-            now; ``off_mm`` now, from ``off_of`` readings, and ``off_before_mm`` before the last decision; ``since`` and
-            ``last_good``, each a record; ``rollback``, a command.
+        ``earlier`` is the last decision where none matters now; ``since`` and ``last_good`` are each a record.
         """
         causes = self._causes(level)
         cause = causes[-1] if causes else None
@@ -329,7 +320,6 @@ class Situation:
         return [event for event in meant if event["sequence"] == meant[-1]["sequence"]]
 
     def _advice(self, level: str) -> str | None:
-        """What to do at this level: what the newest event that led to it says, a decision before a change of level."""
         leading = [event for event in self._noted if _meant_level(event) == level and event.get("do")]
         newest = [event for event in leading if event["sequence"] == leading[-1]["sequence"]]
         decided = [event for event in newest if event["event"] == "decision"]
@@ -383,13 +373,8 @@ def is_running(folder: Path) -> bool | None:
 def present(folder: Path) -> dict[str, Any]:
     """The newest status in a folder, and whether what wrote it still runs, whatever it wrote last.
 
-    Returns:
-        what is in ``status.json``; ``life`` (``waiting`` before the first status, ``running``, ``ended``, ``stopped``
-        by a fault, ``killed`` or ``hangs``); ``over``, a sentence where nothing follows the arm; and ``situation``,
-        whose ``do`` then says so too.
-
-    Raises:
-        InputError: it may not be read.
+    ``life`` is ``waiting`` (before the first status), ``running``, ``ended``, ``stopped`` (by a fault), ``killed`` or
+    ``hangs``; ``over`` is a sentence where nothing follows the arm, and ``do`` of the ``situation`` then says so too.
     """
     try:
         read = json.loads((folder / STATUS).read_text(encoding="utf-8", errors="replace"))

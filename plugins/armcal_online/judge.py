@@ -28,7 +28,6 @@ from armcal_online.window_evidence import HypothesisFilter, Size, rate_of, size_
 
 
 def change_decision(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:
-    """A change that is followed from now on."""
     best = alike[0]
     hypothesis, kind, subject = best.hypothesis, best.hypothesis.kind, best.hypothesis.subject
     since = state.recent[best.onset :]
@@ -63,7 +62,7 @@ def together_decisions(
     others: Sequence[Explanation],
     sizes: Sequence[Size],
 ) -> tuple[Decision, ...]:
-    """Two changes at once that are followed from now on: a decision each, or one where several pairs are as likely."""
+    """A decision for each of two changes at once, or one where several pairs are as likely."""
     best, since = alike[0], state.recent[alike[0].onset :]
     log_odds, onset = _against(alike, others), since[0].sequence
     why = (
@@ -93,7 +92,6 @@ def slow_decision(
 
 
 def unnamed_decision(candidates: Sequence[str], since: int, records: int, log_odds: float, factor: float) -> Decision:
-    """Something moves slowly, and the records do not distinguish what."""
     what = f"Something moves more than stated: {_or(candidates)}"
     why = (
         f"no single one of the {records} records since shows it, but all of them together do, and they fit these about "
@@ -122,7 +120,6 @@ def drift_decision(state: State, count: int, ratio: float, by_chance: float, fac
 
 
 def unexplained_decision(state: State, rejected: int, by_chance: float, best: Explanation) -> Decision:
-    """Records do not fit, and nothing is decided yet."""
     what = f"{rejected} of the last {len(state.recent)} records do not fit, and no change explains them yet"
     why = (
         f"outliers alone are rarely so many; the likeliest change is {_named(best.hypothesis)} "
@@ -138,10 +135,9 @@ def unfit_decision(state: State, steps: Steps, why: str, log_odds: float, since:
 
 
 def beside_model_error(decision: Decision, far: float, log_likelihood: float, settings: ChangeSettings) -> Decision:
-    """A decision whose odds are over the model's own error too, which is named beside it where it may be that.
+    """Its odds are over the model's own error too, which is named beside it where it may be that.
 
-    How ``far`` the change moves the readings and the log likelihood of that are of ``sizes.in_model_errors``. The
-    model's own error needs no event to be there; a change is as rare as ``settings`` have it.
+    ``far`` and ``log_likelihood`` are of ``in_model_errors``. That error needs no event to be there; a change is rare.
     """
     log_odds = log_likelihood - math.log(settings.probability)
     if log_odds < -math.log(settings.naming_odds):
@@ -177,7 +173,6 @@ def _named(hypothesis: Hypothesis) -> str:
 
 
 def _happened(change: Hypothesis, size: Size) -> str:
-    """What happened, as a clause."""
     subject = spoken(change.subject)
     clauses = {
         "joint_slipped": f"Joint {subject} slipped by {size.shown}",
@@ -211,8 +206,6 @@ _TOO_MANY = 1e-3  # more outliers than chance makes with this probability are a 
 
 
 class Judge:
-    """Judges the last records of a recalibration."""
-
     def __init__(
         self,
         space: StateSpace,
@@ -226,7 +219,6 @@ class Judge:
         self._changes, self._settings = changes, settings
 
     def after(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """What is decided after a record, the last of ``state.recent``; the state follows it."""
         state, naming = self._name_suspect(state)
         state, change = self._detect_change(state)
         if not change and state.recent and not state.recent[-1].rejected:
@@ -237,7 +229,7 @@ class Judge:
         return (replace(state, slow=replace(state.slow, tracks=())) if decisions else state), decisions
 
     def health(self, state: State, decisions: Sequence[Decision], first: Linearised) -> Health:
-        """Health after a record, the last of ``state.recent`` before the decisions; ``first`` is at its prior mean."""
+        """After a record, the last of ``state.recent`` before the decisions; ``first`` is at its prior mean."""
         health, settings, recent = state.health, self._settings, state.recent[-1]
         for decision in decisions:
             if decision.kind in EXPLAINED and health.level != "lost":
@@ -266,7 +258,6 @@ class Judge:
         return health.calmed(settings.levels.calm)
 
     def _detect_change(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """Whether the last records indicate a change."""
         large = [
             i
             for i, record in enumerate(state.recent)
@@ -355,7 +346,6 @@ class Judge:
     def _follow_change(
         self, state: State, alike: Sequence[Explanation], others: Sequence[Explanation]
     ) -> tuple[State, tuple[Decision, ...]]:
-        """The state with what a change reopens, from before it on."""
         best, since = alike[0], state.recent[alike[0].onset :]
         reopened = {id(change): change for explanation in alike for change in explanation.hypothesis.singles}
         directions = np.hstack([change.directions for change in reopened.values()])
@@ -418,7 +408,6 @@ class Judge:
         return after, (named_decision(state, change, names, margin, size),)
 
     def _detect_drift(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """Whether the NIS as a whole is too large, though no record's is."""
         settings = self._settings.levels
         if len(state.nis_window) < settings.window:
             return state, ()
@@ -439,7 +428,6 @@ class Judge:
         return state.following(belief), (decision,)
 
     def _detect_slow(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """Whether many records together speak for a change that none of them shows."""
         weighings, settings = self._slow.weighed(state.slow), self._settings.changes
         if not weighings or state.suspects or weighings[0].log_odds <= math.log(settings.odds):
             return state, ()

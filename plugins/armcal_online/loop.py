@@ -44,8 +44,6 @@ Event = dict[str, Any]
 
 @dataclass
 class Progress:
-    """Rows taken by file, the records taken last, and whether records are passed over."""
-
     records: int = 0  # how many records were journalled, from the beginning
     paused: bool = False
     positions: dict[str, int] = field(default_factory=dict)  # the last row taken, by file
@@ -64,7 +62,6 @@ class Progress:
                 del self.recent[next(iter(self.recent))]
 
     def repeated(self, incoming: Incoming) -> int | None:
-        """Under which sequence number the same record of a stream was taken not long ago."""
         return None if incoming.source_key or incoming.fault else self.recent.get(_mark(incoming))
 
 
@@ -88,7 +85,6 @@ class StateReplayer:
         return {"state": self._session.snapshot(), "progress": asdict(self.progress)}
 
     def replay(self, checkpoint: Entry, entries: Iterable[Entry]) -> None:
-        """Take up the state of a checkpoint, and do what the entries after it say."""
         sequence = checkpoint.sequence
         try:
             self.progress = Progress(**checkpoint.content["progress"])
@@ -105,7 +101,6 @@ class StateReplayer:
             ) from fault
 
     def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
-        """Do what an entry says; the events of it."""
         if kind == RECORD:
             incoming = Incoming.from_dict(content)
             self.progress.take(incoming, sequence)
@@ -124,11 +119,7 @@ class StateReplayer:
         return ()
 
     def go_back(self, sequence: int) -> None:
-        """The estimate as it was after an entry; how far the source was taken stays.
-
-        Raises:
-            DataError, InputError: the journal does not reach there; nothing is changed.
-        """
+        """The estimate as it was after an entry; how far the source was taken stays."""
         before, progress = self._session.snapshot(), self.progress
         try:
             self.replay(*self._journal.until(sequence))
@@ -167,11 +158,9 @@ class Outputs:
         self._attempt(STATUS, lambda: write_whole(self.folder / STATUS, data))
 
     def situation(self, status: Mapping[str, Any]) -> dict[str, Any]:
-        """What to do, how far off, since when, and the way back, at the level of a status."""
         return self._situation.first_screen(str(status.get("level")), status.get("last_good"), self.folder)
 
     def calibration(self, text: str) -> bool:
-        """The updated calibration, in place of the one before; whether that went well."""
         return self._attempt(CALIBRATION, lambda: self._replace_calibration(text.encode()))
 
     def make_room(self) -> None:
@@ -205,7 +194,6 @@ class Outputs:
         self._stream.write(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
 
     def _attempt(self, name: str, write: Callable[[], None]) -> bool:
-        """Write a file; whether that went well."""
         try:
             write()
         except OSError as fault:
@@ -220,16 +208,6 @@ class Outputs:
 
 
 class Recalibration:
-    """A source, a journal, an estimate and its outputs, moved on record by record.
-
-    Attributes:
-        sequence: of the last entry that changed anything.
-        finishing: why it is about to end; empty while it is not.
-
-    Raises:
-        InputError: somebody else serves the control socket, or it cannot be made.
-    """
-
     def __init__(
         self,
         source: Source,
@@ -255,11 +233,7 @@ class Recalibration:
         return self._replayer.progress.paused
 
     def run(self) -> None:
-        """Until the source ends, a signal comes, or a request to finish; the status says a fault too.
-
-        Raises:
-            JournalFullError, JournalFailedError: the disk is full or fails; what was acknowledged is safe.
-        """
+        """Until the source ends, a signal comes, or a request to finish; the status says a fault too."""
         with Signals() as signals:
             try:
                 self._follow(signals)
@@ -294,7 +268,6 @@ class Recalibration:
         self._report("finished", sentence=sentence)
 
     def step(self, wait_s: float) -> None:
-        """Take one record, if there is one within the wait, and write what is due."""
         if self.paused and self._source.keeps_records:
             time.sleep(wait_s)
         elif (incoming := self._source.incoming(wait_s)) is not None:
@@ -313,11 +286,7 @@ class Recalibration:
             self._outputs.status(self.status())
 
     def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The reply to one of the known commands, which act at once, or to a record: ``ok``, and what it says.
-
-        Raises:
-            ArmcalError: the request cannot be met.
-        """
+        """The reply to a command or a record; what cannot be met raises an ArmcalError."""
         if "command" not in request:
             return self.receive(request)
         match request["command"]:
@@ -335,15 +304,7 @@ class Recalibration:
         return {"ok": True, **self.status()}
 
     def roll_back(self, to: Any) -> Mapping[str, Any]:
-        """Take up the estimate as it was after an entry (its number), a record (its name) or the last good record.
-
-        Records since then stay taken, and have no effect.
-
-        Raises:
-            InputError: it is none of them, or no record was good.
-            DataError: the journal does not reach there; nothing is changed.
-            JournalFullError: there is no room to note it; nothing is changed.
-        """
+        """To an entry (number), a record (name) or the last good record; records since stay taken, without effect."""
         if to == GOOD:
             good = self._session.status()["last_good"]
             if good is None:
@@ -389,11 +350,6 @@ class Recalibration:
             self._report("calibration", path=str(self._outputs.folder / CALIBRATION))
 
     def receive(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        """Take a record that a program sent to the control socket; its acknowledgement, once it is kept.
-
-        Raises:
-            InputError: records are read from elsewhere, or it is about to end.
-        """
         if not isinstance(self._source, Sent) or self.finishing:
             why = "it is about to end" if self.finishing else "records are read from elsewhere"
             hint = "Send it again when it runs." if self.finishing else "Start `armcal recalibrate` with --from socket."
@@ -438,7 +394,6 @@ class Recalibration:
 
 
 def entry_named(journal: KeptJournal, name: str) -> int:
-    """The entry of the last record of a name that a journal keeps."""
     named = [e.sequence for e in journal.entries() if e.kind == RECORD and e.content.get("id") == name]
     if not named:
         hint = "Give an entry's number or a record's name, as events have them, or the last good record: rollback good."

@@ -62,12 +62,7 @@ _FARTHEST = 100.0  # rad or m; a joint beyond it is a fault of the record
 
 
 class Recalibrator:
-    """A session that begins at a calibration: mutable, and nothing but a ``State`` changes in it.
-
-    Raises:
-        ConfigError: settings are refused, or the calibration keeps no covariance.
-        PluginError: no such estimator.
-    """
+    """A session that begins at a calibration: mutable, and nothing but a ``State`` changes in it."""
 
     def __init__(
         self, calibration: Calibration, settings: RecalibrateSettings, registry: PluginRegistry | None = None
@@ -105,11 +100,6 @@ class Recalibrator:
         return {name: [value, sd] for name, value, sd in rows if sd > 0 or name not in held}
 
     def take(self, incoming: Incoming, sequence: int) -> tuple[dict[str, Any], ...]:
-        """Take one record; what came of it, as events.
-
-        Raises:
-            ProblemError: the numbers of the belief are no longer sound.
-        """
         time = incoming.channels.get("time")
         time = time if time is not None and math.isfinite(time) else None
         tick = ticked(self.state.clock, time, incoming.arrived, self.settings.clock)
@@ -161,7 +151,6 @@ class Recalibrator:
     def _judged(
         self, incoming: Incoming, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]
     ) -> tuple[dict[str, Any], ...]:
-        """Gate a record, take it in if it is accepted, and judge what the last records mean now."""
         process_noise, observer = self.setup.process_noise, self.setup.observer
         before = self._slow.carried(state.slow, process_noise.faded(state.belief, passed), passed["time"])
         state = replace(state, belief=before, slow=self._slow.passed(state.slow, passed))
@@ -202,11 +191,7 @@ class Recalibrator:
     def _gated(
         self, state: State, readings: tuple[Reading, ...], passed: Mapping[str, float]
     ) -> tuple[State, Linearised, float]:
-        """The state with a record, accepted or rejected; the record at its prior mean, and the limit of its NIS.
-
-        Raises:
-            ArmcalError: the filter cannot use it where it has come to.
-        """
+        """The state with a record, accepted or rejected; the record at its prior mean, and the limit of its NIS."""
         observer, space, before = self.setup.observer, self.setup.space, state.belief
         noise = observer.joint_noise(space.inside(before.values(space)), readings)
         first = observer.observation(before, readings, noise).at(before.gaussian.mean)
@@ -226,7 +211,6 @@ class Recalibrator:
     def _record_event(
         self, incoming: Incoming, state: State, recent: Recent, first: Linearised, limit: float
     ) -> dict[str, Any]:
-        """A record that was accepted or rejected."""
         verdict = "rejected" if recent.rejected else "accepted"
         relation = "above" if recent.rejected else "within"
         nis = f"{recent.nis:,.0f}" if 1000 <= recent.nis < 1e9 else f"{recent.nis:.3g}"
@@ -304,12 +288,6 @@ class Recalibrator:
         return self.state.as_dict()
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Take up a state.
-
-        Raises:
-            DataError: it is not one of this calibration with these settings.
-            KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
-        """
         state = State.from_dict(snapshot)
         count, expected = len(state.belief.gaussian.mean), self.setup.observer.size
         if count != expected:
@@ -341,10 +319,7 @@ _MOST_LOG_ODDS = 700.0
 
 
 def decided(state: State, decision: Decision, tip: TipError | None, calm: int) -> dict[str, Any]:
-    """Something that was decided: what, since when, how sure, how far the tip was off, what to do, what confirms it.
-
-    ``state`` is that after the decision; after ``calm`` records without trouble the level improves.
-    """
+    """``state`` is that after the decision; after ``calm`` records without trouble the level improves."""
     first, good = state.known(decision.since), state.good_before(decision.since)
     log_odds = min(max(decision.log_odds, -_MOST_LOG_ODDS), _MOST_LOG_ODDS)
     event = _event("decision", state, kind=decision.kind, level=decision.level, what=f"{decision.what}.")

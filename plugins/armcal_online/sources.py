@@ -60,13 +60,6 @@ class Place:
 
 @dataclass(frozen=True)
 class Incoming:
-    """One record as it came.
-
-    Attributes:
-        channels: SI numbers by channel (``arm.q1``, ``tracker.x``, ``gravity_z``, ``time``); NaN where a value is
-            missing, infinite as given.
-    """
-
     record_id: str  # its id; the row where its source gives none
     channels: Mapping[str, float]
     labels: Mapping[str, str]  # text columns that no channel claims (a socket's name)
@@ -89,11 +82,6 @@ class Incoming:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Incoming:
-        """The record that ``as_dict`` wrote.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is no such record.
-        """
         return cls(
             record_id=str(content["id"]),
             channels={name: float(value) for name, value in content["channels"].items()},
@@ -106,15 +94,9 @@ class Incoming:
 
 
 class Source(Protocol):
-    """Records, one at a time.
-
-    Attributes:
-        keeps_records: whether what is not taken stays in it (a file), or is lost (a stream).
-    """
-
     @property
     def keeps_records(self) -> bool:
-        """See above."""
+        """Whether what is not taken stays in it (a file), or is lost (a stream)."""
 
     @property
     def ended(self) -> bool:
@@ -128,7 +110,6 @@ class Source(Protocol):
         return
 
     def close(self) -> None:
-        """Let go of files and sockets, if there are any."""
         return
 
 
@@ -142,21 +123,11 @@ class RowParser:
         self._plans: dict[tuple[str, ...], Plan | str] = {}
 
     def table(self, line: str, source: str, number: int) -> tuple[LineTable, Plan]:
-        """The header of a CSV table, and which column is what.
-
-        Raises:
-            DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
-        """
         lines = LineTable.begun(line, source, number)
         header = renamed(header_of(lines.header, source, number), self._columns)
         return lines, self._matched(header)
 
     def row(self, table: LineTable, plan: Plan, line: str, place: Place) -> Incoming:
-        """The record in a line of a table.
-
-        Raises:
-            DataError: it is no row of the table.
-        """
         return self._record(plan, table.row(line, place.row), place)
 
     def json_text(self, text: str, place: Place) -> Incoming:
@@ -167,7 +138,6 @@ class RowParser:
         return self.object(fields, place)
 
     def object(self, fields: Any, place: Place) -> Incoming:
-        """The record in a JSON object, name to number or text."""
         if not isinstance(fields, dict):
             text = "an array" if isinstance(fields, list) else _short(json.dumps(fields), 40)
             return faulty(place, f"Found {text}, expected a JSON object.")
@@ -187,11 +157,6 @@ class RowParser:
         return self._record(plan, list(fields.values()), place)
 
     def _matched(self, header: Header) -> Plan:
-        """Which column is what.
-
-        Raises:
-            DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
-        """
         plan = match_columns(header, self._optional)
         lacking = self._lacking(set(plan.channels))
         if lacking is not None:
@@ -242,11 +207,7 @@ def faulty(place: Place, sentence: str) -> Incoming:
 
 
 def _number(value: Any, name: str) -> float:
-    """A cell, or a value of a JSON object, in the column of a name; NaN where it is missing.
-
-    Raises:
-        DataError: it is no number.
-    """
+    """A cell, or a value of a JSON object, in the column of a name; NaN where it is missing."""
     if value is None:
         return math.nan
     if isinstance(value, str):
@@ -289,10 +250,6 @@ class Lines(Source):
     A text is known again by its first record, and is read on after the last row that was taken of it, be it a file or
     what ``tail -n +1 -F`` gives of one. The header once more begins another text, as where a log was rotated. A last
     line without an end is a record in a file; in a pipe it may have been cut short.
-
-    Raises:
-        InputError: there is no such file.
-        DataError: it is empty, or its header cannot be used.
     """
 
     keeps_records, ended = True, False
@@ -410,12 +367,6 @@ class Sent(Source):
 
 
 def open_source(text: str, rows: RowParser) -> Source:
-    """A source by its name: ``socket``, ``-``, or a CSV file.
-
-    Raises:
-        InputError: it is none of these, or cannot be opened.
-        DataError: the header of a file cannot be used.
-    """
     if text == "socket":
         return Sent(rows)
     if text == "-":

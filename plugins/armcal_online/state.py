@@ -59,12 +59,6 @@ _SIGNIFICANT_SD = 3.0  # residuals above the stated noise by less are chance's
 
 @dataclass(frozen=True)
 class FilterSetup:
-    """What a recalibration starts with.
-
-    Attributes:
-        model_errors: what the model itself errs by, by measurement; those that err by no more than noise are left out.
-    """
-
     problem: Problem  # compiled once
     space: StateSpace  # of its free parameters
     observer: Observer  # makes observations of records
@@ -73,20 +67,10 @@ class FilterSetup:
     request: ReadRequest  # what a source should look for
     left_out: tuple[str, ...]  # measurements that cannot be taken one record at a time
     held: frozenset[str]  # parameters that are as they were calibrated until a decision opens them
-    model_errors: Mapping[str, ModelError]
+    model_errors: Mapping[str, ModelError]  # by measurement, but those that err by no more than noise
 
 
 def filter_setup(calibration: Calibration, settings: RecalibrateSettings, loads: bool = False) -> FilterSetup:
-    """What a recalibration starts with.
-
-    Args:
-        calibration: with its covariance.
-        settings: of the recalibration.
-        loads: whether a payload that no record states, and another direction of gravity, may be found.
-
-    Raises:
-        ConfigError: the calibration keeps no covariance, or a glob or a quantity in the settings is refused.
-    """
     system = calibration.system
     measurements = {n: m for n, m in system.measurements.items() if not isinstance(m, PairedMeasurement)}
     parameters, opened = _parameters(calibration, settings, loads)
@@ -207,7 +191,6 @@ def _noise_and_model_errors(
 
 
 def _freedoms(calibration: Calibration, names: Iterable[str]) -> dict[str, float]:
-    """Degrees of freedom with which the noise of measurements is known: their own, or those of the fit."""
     noise = calibration.record.noise
     own, of_fit = noise.get("scatter") or {}, max(noise["degrees_of_freedom"], 1)
     return {name: float((own.get(name) or {}).get("freedom") or of_fit) for name in names}
@@ -226,7 +209,6 @@ def _noise_scale(calibration: Calibration) -> float:
 
 
 def _full_record(calibration: Calibration, measurements: Mapping[str, Measurement]) -> Dataset:
-    """A record with everything that one may carry: functions are compiled for it."""
     arms = calibration.system.arms
     names = [w.channel for w in requested_channels(arms, measurements, measured=True) if "." in w.channel]
     names += [f"gravity_{axis}" for axis in "xyz"] + ["payload"]
@@ -260,10 +242,7 @@ def deviations(space: StateSpace, belief: Belief) -> Array:
 
 
 def calibration_text(calibration: Calibration, setup: FilterSetup, belief: Belief, source: Mapping[str, Any]) -> str:
-    """The text of calibration.yaml; ``source`` is where it comes from (records, health level, last record).
-
-    A payload that was found is stated in its statics; parameters that no decision has opened are as they were.
-    """
+    """A payload that was found is stated in its statics; parameters that no decision has opened are as they were."""
     space = setup.space
     values = most_likely(space, belief)
     covariance = belief.gaussian.covariance[: len(space.scales), : len(space.scales)]
@@ -301,10 +280,7 @@ def calibration_text(calibration: Calibration, setup: FilterSetup, belief: Belie
 def _parameter_records(
     calibration: Calibration, space: StateSpace, values: Array, free: Array, sd: Mapping[int, float]
 ) -> tuple[ParameterRecord, ...]:
-    """Every entry with its value and, where it is known, its standard deviation (``sd``, by place).
-
-    ``free`` are the values that the records alone lead to, beyond the bounds.
-    """
+    """``free`` are the values that the records alone lead to, beyond the bounds; ``sd`` is by place."""
     bounds = {
         space.parameters.entries_of(block.name).start: (block.domain.lower, block.domain.upper)
         for block in space.parameters.free
@@ -357,18 +333,12 @@ def _square_root(scales: Array, covariance: Array) -> tuple[tuple[float, ...], .
 
 @dataclass(frozen=True)
 class Health:
-    """A level, the number of records since the last trouble, and the reason of the level.
-
-    It gets no better than ``best`` while a change is unexplained, however well the records fit.
-    """
-
     level: Level = "nominal"
-    calm: int = 0
-    sentence: str = "The records agree with the calibration."
-    best: Level = "nominal"
+    calm: int = 0  # records since the last trouble
+    sentence: str = "The records agree with the calibration."  # why the level is what it is
+    best: Level = "nominal"  # it gets no better while a change is unexplained, however well the records fit
 
     def troubled(self, level: Level, sentence: str) -> Health:
-        """After trouble: at least that bad, counting anew."""
         if LEVELS.index(level) > LEVELS.index(self.level):
             return replace(self, level=level, calm=0, sentence=sentence)
         return replace(self, calm=0)
@@ -389,8 +359,7 @@ class Health:
 def nis_limit(dof: int, probability: float, freedom: float = math.inf) -> float:
     """What NIS stays below with a probability, where all is as believed.
 
-    ``freedom``: degrees of freedom with which the noise is known. Where they are few, NIS by ``dof`` has an F
-    distribution, as Hotelling's T-squared [Hotelling1931].
+    Where few degrees of ``freedom`` determined the noise, it has an F distribution, Hotelling's [Hotelling1931].
     """
     if math.isinf(freedom):
         return float(chdtri(float(dof), 1 - probability))
@@ -405,8 +374,7 @@ def many_outliers(count: int, records: int, fraction: float) -> float:
 def improbability(nis_window: Sequence[tuple[float, int]], known: float = math.inf) -> float:
     """How probable NIS (each with its degrees of freedom, in order) at least as large in sum are by chance.
 
-    Neighbours that resemble each other count for less than their number: by their first serial correlation. ``known``:
-    degrees of freedom with which the noise is known, which all of them share.
+    Neighbours that resemble each other count for less than their number: by their first serial correlation.
     """
     if len(nis_window) < 3:
         return 1.0
@@ -428,29 +396,21 @@ _REFRESHED = 25  # after so many accepted records the origin is put where it is 
 
 @dataclass(frozen=True)
 class Clock:
-    """The time (s) of the newest record, and how many in a row have been older since, the latest at ``behind``."""
-
-    now: float | None = None
-    late: int = 0
-    behind: float = 0.0
+    now: float | None = None  # time (s) of the newest record
+    late: int = 0  # so many in a row have been older since
+    behind: float = 0.0  # the latest of them
 
 
 @dataclass(frozen=True)
 class Tick:
-    """The clock after a record, the time that parameters had to wander (s), why the record is stale, what was odd."""
-
-    clock: Clock
-    passed: float
-    stale: str = ""
-    note: str = ""
+    clock: Clock  # after a record
+    passed: float  # the time (s) that parameters had to wander
+    stale: str = ""  # why the record is
+    note: str = ""  # what was odd
 
 
 def ticked(clock: Clock, time: float | None, arrived: float, settings: ClockSettings) -> Tick:
-    """The clock after a record; one without a time leaves it as it was.
-
-    A clock that jumps ahead counts as its longest step. One that was set back makes records stale until enough of them
-    agree on the new time.
-    """
+    """A clock that jumps ahead counts as its longest step; set back, it makes records stale until enough agree."""
     if time is None:
         return Tick(clock, 0.0)
     if settings.longest_age is not None and arrived - time > settings.longest_age:
@@ -479,8 +439,6 @@ def _span(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Arrival:
-    """A record that came."""
-
     record_id: str  # its own name
     content: str  # a hash of it
     sequence: int  # its number
@@ -490,12 +448,7 @@ class Arrival:
 
 @dataclass(frozen=True)
 class State:
-    """Between two records; with it and the records after, everything comes out again.
-
-    Attributes:
-        counts: of accepted, rejected and ignored records.
-        suspects: joints that could not be distinguished when one of them stepped, each followed by itself.
-    """
+    """Between two records; with it and the records after, everything comes out again."""
 
     belief: Belief  # about parameters and Gauss-Markov states
     recent: tuple[Recent, ...] = ()  # the last records, for judgement
@@ -503,11 +456,15 @@ class State:
     place: float | None = None  # the last record's ``sequence``; None before the first
     health: Health = field(default_factory=Health)  # and why
     nis_window: tuple[tuple[float, int], ...] = ()  # NIS and degrees of freedom of the last accepted records
-    counts: Mapping[str, int] = field(default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0})
+    counts: Mapping[str, int] = field(
+        default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0}
+    )  # of records
     ids: tuple[Arrival, ...] = ()  # the last records, in order
     good: Arrival | None = None  # the last good record of those before
     wary: bool = False  # whether the last records look like a change, which is not certain yet
-    suspects: tuple[Candidate, ...] = ()
+    suspects: tuple[
+        Candidate, ...
+    ] = ()  # joints that no record distinguished when one stepped, each followed by itself
     suspected: int = 0  # the first record after that
     before_change: Belief | None = None  # the belief before it
     drifted: int = 0  # how often in a row the NIS as a whole was too large
@@ -523,7 +480,6 @@ class State:
         return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
 
     def good_before(self, sequence: int) -> Arrival | None:
-        """The last good record before a number; None before the first."""
         earlier = (arrival for arrival in reversed(self.ids) if arrival.is_good and arrival.sequence < sequence)
         return next(earlier, self.good if self.good is not None and self.good.sequence < sequence else None)
 
@@ -534,12 +490,6 @@ class State:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> State:
-        """What ``as_dict`` wrote.
-
-        Raises:
-            DataError: an array is not whole.
-            KeyError, TypeError, ValueError, AttributeError, IndexError: it is no state.
-        """
         state: State = _decoded(cls, {**content, "nis_window": content["nis"]})
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
@@ -553,14 +503,13 @@ def remembering(state: State, arrival: Arrival) -> State:
 
 
 def troubled(state: State, decisions: Sequence[Decision], is_good: bool) -> State:
-    """The state that knows whether its last record is good, and that none is from the first that a decision affects."""
+    """No record is good from the first that a decision affects."""
     since = min((decision.since for decision in decisions), default=state.sequence + 1)
     *earlier, newest = (replace(a, is_good=False) if a.sequence >= since else a for a in state.ids)
     return replace(state, ids=(*earlier, replace(newest, is_good=is_good)))
 
 
 def _encoded(value: Any) -> Any:
-    """As JSON; of an array its shape, and its bytes in base64 (little-endian doubles)."""
     if isinstance(value, np.ndarray):
         raw = np.ascontiguousarray(value, dtype="<f8").tobytes()
         return {"shape": list(value.shape), "float64": base64.b64encode(raw).decode("ascii")}
@@ -576,7 +525,6 @@ def _encoded(value: Any) -> Any:
 
 
 def _decoded(kind: Any, content: Any) -> Any:
-    """The value of a type that ``_encoded`` made ``content`` of."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is np.ndarray:
         raw = np.frombuffer(base64.b64decode(content["float64"]), dtype="<f8")
@@ -605,14 +553,6 @@ def _decoded(kind: Any, content: Any) -> Any:
 
 
 def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
-    """The state with a record taken in by an estimator.
-
-    The state's belief is that at the record's time; of NIS it keeps ``nis_window``.
-
-    Raises:
-        NotConvergedError: the arm has no elastic equilibrium near the belief.
-        ProblemError: the numbers of the belief are no longer sound.
-    """
     space, before = setup.space, state.belief
     observation = setup.observer.observation(before, recent.readings, recent.joint_noise)
     belief = before.updated(space, estimator.update(before.gaussian, observation).posterior)

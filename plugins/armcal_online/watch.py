@@ -55,7 +55,6 @@ def watch(folder: Path, port: int, once: bool) -> None:
 
 
 def first_screen(now: Mapping[str, Any]) -> list[str]:
-    """The first screen as lines of text."""
     screen, life, level = now["situation"], now["life"], now.get("level", "unknown")
     gone = {"killed": "not running", "stopped": "not running", "hangs": "not answering"}.get(life)
     size, before, of = _mm(screen.get("off_mm")), _mm(screen.get("off_before_mm")), screen.get("off_of")
@@ -127,11 +126,7 @@ def page() -> tuple[bytes, str]:
 
 
 class WatchServer(ThreadingHTTPServer):
-    """Serves a folder's state to this machine; from elsewhere SSH leads there.
-
-    Raises:
-        InputError: the port cannot be listened on.
-    """
+    """Serves a folder's state to this machine; from elsewhere SSH leads there."""
 
     daemon_threads, block_on_close = True, False
 
@@ -151,11 +146,7 @@ class WatchServer(ThreadingHTTPServer):
         return f"http://{_HOST}:{self.server_address[1]}/"
 
     def allows(self, host_header: str | None) -> bool:
-        """Judge a request by its Host header, which must name this machine.
-
-        A page of another site, whose name was made to point here, is refused. The port may be any, since a tunnel may
-        begin at another one.
-        """
+        """A page of another site, whose name was made to point here, is refused; a tunnel may begin at any port."""
         named = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[]+))(?::[0-9]*)?", (host_header or "").strip().lower())
         return named is not None and (named[1] or named[2]) in ("localhost", _HOST, "::1")
 
@@ -168,7 +159,6 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version, timeout = "armcal", "", _PATIENCE_S
 
     def do_GET(self) -> None:
-        """The page, or the state."""
         address = urlsplit(self.path)
         if not self.server.allows(self.headers.get("Host")):
             self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name in the address.\n")

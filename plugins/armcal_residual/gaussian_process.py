@@ -58,17 +58,14 @@ _LEFT = 0.01  # Of the noise's variance: so little of the process may be left be
 
 @dataclass(frozen=True)
 class _JointProcess:
-    """A process of one joint (from 0) over its angle, as features of the rows of the residuals.
-
-    ``between`` is the mean share of the variance that features leave.
-    """
+    """A process of one joint (from 0) over its angle, as features of the rows of the residuals."""
 
     joint: int
     inputs: tuple[Input, ...]
     poses: Array
     roots: Array
     rows: Array
-    between: float
+    between: float  # the mean share of the variance that features leave
 
     @classmethod
     def over(cls, errors: ModelErrors, joint: int, length: float) -> _JointProcess:
@@ -90,10 +87,7 @@ class _JointProcess:
 
 
 def of_joints(errors: ModelErrors, before: Sequence[ProcessSettings] = ()) -> tuple[list[ProcessSettings], Array]:
-    """Processes of the joints that turn, and what they leave of the residuals (N x rows).
-
-    Length scales are looked for near those of processes that were learned ``before``, if some were.
-    """
+    """Processes of the joints that turn, and what they leave; lengths are looked for near those learned ``before``."""
     left = errors.residuals.ravel()
     turning = [i for i, kind in enumerate(errors.dimensions) if kind == "angle"]
     moved = _seen(errors, [i for i in turning if np.ptp(errors.postures.commands[i]) > _JOINT_LENGTHS[-1]])
@@ -113,7 +107,6 @@ def of_joints(errors: ModelErrors, before: Sequence[ProcessSettings] = ()) -> tu
 
 
 def _part(terms: Sequence[_JointProcess], regression: Regression, blocks: Sequence[int]) -> ProcessSettings:
-    """The sum of a joint's processes as learned: what is known of it is more than what is known of each."""
     variances = regression.variances[list(blocks)]
     scale = float(np.sqrt(variances.sum()))
     shares = [float(own / variances.sum()) for own in variances]
@@ -140,10 +133,7 @@ class _LengthSearch:
         self._regressions: dict[_Places, Regression] = {}
 
     def likeliest(self, before: Mapping[int, float]) -> _Places | None:
-        """Places in ``_JOINT_LENGTHS`` of the finer ones, one a joint; None where the records are too few for any.
-
-        ``before`` are length scales of some joints by which the search begins, the longest for the others.
-        """
+        """Places in ``_JOINT_LENGTHS`` of the finer ones, one a joint; None where the records are too few for any."""
         begun = tuple(_JOINT_LENGTHS.index(before.get(joint, _JOINT_LENGTHS[0])) for joint in self._joints)
         possible = [begun] if any(begun) and self._is_possible(begun) else []
         if not possible:
@@ -164,7 +154,6 @@ class _LengthSearch:
         return [self._process(key) for key in self._keys(places)]
 
     def regression(self, places: _Places, near: _Places | None = None) -> Regression:
-        """On their features, from what is likeliest of others that are ``near``."""
         if places not in self._regressions:
             keys, start = self._keys(places), None
             matrix = np.block([[self._product(a, b) for b in keys] for a in keys])
@@ -201,7 +190,6 @@ class _LengthSearch:
 
 
 def _seen(errors: ModelErrors, joints: Sequence[int]) -> list[int]:
-    """Those of some joints (from 0) whose corrections residuals show."""
     shown = {i: float(np.sum(errors.slopes[:, :, len(OF_TOOL) + i] ** 2)) for i in joints}
     return [i for i, square in shown.items() if square > _UNSEEN * max(shown.values())]
 
@@ -209,10 +197,7 @@ def _seen(errors: ModelErrors, joints: Sequence[int]) -> list[int]:
 def of_tool(
     errors: ModelErrors, left: Array, most: int, before: Sequence[ProcessSettings] = ()
 ) -> list[ProcessSettings]:
-    """Processes of the tool's shifts, and turns, where what is left of the residuals (N x rows) follows one.
-
-    Length scales are looked for near those of processes that were learned ``before``, if some were.
-    """
+    """Of the tool's shifts, and turns, where what is left of the residuals (N x rows) follows one."""
     pose, around, tool = *_inputs(errors), errors.of_tool
     known = {(part.first, len(part.terms[0].inputs)): part.terms[0].inputs for part in before}
     processes = []
@@ -292,7 +277,6 @@ def _process(
 def _sought(
     numbers: Array, own: Array, inputs: Sequence[tuple[Kind, int]], near: Sequence[Array]
 ) -> tuple[_Likelihood, Array]:
-    """The likelihood of some of the records, and where it is largest, from what is near, or else from fixed starts."""
     order = np.random.default_rng(0).permutation(len(own))
 
     def of_first(count: int) -> _Likelihood:
@@ -484,7 +468,6 @@ class GaussianProcess(PoseResidual):
         return sum(beyond) <= 0 if joint < 0 else beyond[joint] + sum(beyond) <= 1
 
     def _features(self, part: ProcessSettings, own: Postures) -> Array:
-        """M x N."""
         known = (own.commands, own.approaches, own.surroundings)
         return np.vstack([correlations(*known) for correlations in self._correlations[id(part)]])
 

@@ -66,24 +66,14 @@ class ServoJointSettings(Settings):
 
     @property
     def heat_capacities(self) -> tuple[float, float]:
-        """What winding and case take up for a rise of 1 (s)."""
         return self.winding_time / self.winding_share, self.case_time / (1 - self.winding_share)
 
 
 class JointServo:
     """One servo under a load.
 
-    Attributes:
-        settings: what kind of servo it is.
-        angle: of its horn (rad); ``shaft``: at the encoder, of the gear, ahead of its backlash.
-        target: where it is sent (rad), within its stops; None while it is not powered.
-        approach: the sign of its last motion; 0 before the first.
-        stops: where it can turn no further (rad).
-        failed: it has burnt out, and holds nothing.
-
-    Args:
-        angle: where it stands.
-        table: the angle that it takes at each pulse length, in truth; None: it takes angles.
+    ``angle`` (rad) is of its horn, ``shaft`` of the gear, ahead of backlash; ``approach`` the sign of its last motion.
+    With a ``table`` it takes pulses (s), else angles.
     """
 
     def __init__(self, settings: ServoJointSettings, angle: float, table: PulseTable | None = None) -> None:
@@ -113,14 +103,12 @@ class JointServo:
         return a0 + (command - p0) * (a1 - a0) / (p1 - p0)
 
     def command(self, command: float | None) -> None:
-        """Drive to what a command asks for; None: let go."""
         before, (low, high) = self.target, self.stops
         self.target = None if command is None else min(max(self.angle_of(command), low), high)
         if self._compliance and before is not None and self.target not in (None, before):
             self.approach = 1 if self.target > before else -1
 
     def put(self, angle: float) -> None:
-        """Somebody turns it by hand (rad), where it does not hold."""
         if not self.powered:
             self.shaft = self._horn = self.angle = angle
 
@@ -164,21 +152,15 @@ class JointServo:
         return bool(moved) or slips
 
     def holds(self, torque: float) -> bool:
-        """Whether it is strong enough for a torque (N m), as it is powered now."""
         return self.powered and abs(torque) <= self.settings.stall
 
     def _aim(self, torque: float) -> float:
-        """Where the gear is drawn to: the target, less what the load makes it stand off."""
         low, high = self.stops
         return min(max((self.target or 0.0) + self._compliance * torque, low), high)
 
 
 class ServoHeat:
-    """One servo's temperatures above the air, as fractions of the winding's limit.
-
-    Attributes:
-        winding, case: of the two nodes.
-    """
+    """Temperatures of winding and case above the air, as fractions of the winding's limit."""
 
     def __init__(self, settings: ServoJointSettings) -> None:
         self.winding, self.case = 0.0, 0.0
@@ -186,7 +168,6 @@ class ServoHeat:
         self._longest = _HEAT_STEP * min(settings.winding_time, settings.case_time)
 
     def advance(self, seconds: float, torque: float) -> None:
-        """Hold a torque (N m; 0 for an unpowered servo) for so long."""
         share, (winding_capacity, case_capacity) = self._settings.winding_share, self._capacities
         loss = (torque / self._settings.continuous) ** 2
         while seconds > 0:
@@ -226,18 +207,9 @@ class SafetySettings(Settings):
 
 
 class Safety:
-    """Keeps the log.
+    """Counts offences by kind, and events: pulses that begin (``first_pulse``) or end under load (``drop``).
 
-    Attributes:
-        offences: how many, by kind.
-        events: how often pulses began (``first_pulse``) and ended under load (``drop``).
-
-    Args:
-        settings: what is unsafe.
-        experiment: has joint limits and clearances.
-        pulses: the range (s) of each joint whose servo takes pulses.
-        servos: by joint.
-        log: a file that takes a line of JSON for the first offence of each kind and joint, and for every event.
+    The log has a line for the first offence of each kind and joint, and for every event.
     """
 
     def __init__(
@@ -271,11 +243,7 @@ class Safety:
     def committed(
         self, joint: str, now: float, before: float | None, after: float | None, step: float, torque: float
     ) -> None:
-        """What reaches a joint's servo changes, while it carries a torque (N m).
-
-        ``before`` and ``after`` are pulses (s) or angles (rad); None: it is let go. ``step`` is the smallest change
-        that can be made.
-        """
+        """``before`` and ``after`` are pulses (s) or angles (rad), None: let go; ``step`` is their smallest change."""
         servo, settings = self._servos[joint], self._settings
         if after is None:
             self._commanded.pop(joint, None)
@@ -343,10 +311,7 @@ class Safety:
                 self._offend("clearance", "", now, margin, limit)
 
     def summary(self) -> dict[str, Any]:
-        """Both counters, and the worst of each kind: its joint, and its value and limit as in the log.
-
-        A drop's is how far its joint has fallen (rad) until now.
-        """
+        """The worst of each kind is as in the log; of a drop, how far its joint has fallen (rad) until now."""
         self.judge_clearance()
         for joint, angle in self._dropped.items():
             fell = self._servos[joint].angle - angle
@@ -355,14 +320,12 @@ class Safety:
         return {"offences": dict(self.offences), "events": dict(self.events), "worst": worst}
 
     def go_on(self, account: Mapping[str, Any]) -> None:
-        """Count on from a summary."""
         self.offences.update(account["offences"])
         self.events.update(account["events"])
         for kind, entry in account["worst"].items():
             self._weigh(kind, abs(entry["value"] - entry.get("limit", 0.0)), **entry)
 
     def _weigh(self, kind: str, amount: float, **entry: Any) -> None:
-        """Remember it if it is the worst of its kind."""
         if kind not in self._worst or amount > self._worst[kind][0]:
             self._worst[kind] = amount, entry
 

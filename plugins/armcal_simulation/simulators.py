@@ -51,11 +51,7 @@ class PoseSettings(Settings):
     travel: dict[str, Annotated[tuple[Length, ...], Field(min_length=1)]] = Field(default_factory=dict)
 
     def commands(self, arm: Arm, random: np.random.Generator) -> Array:
-        """Joints x poses, in the arm's order (rad, or m on sliding joints).
-
-        Raises:
-            ConfigError: a joint has no levels, a name is not a joint's, or the grid has fewer poses.
-        """
+        """Joints x poses, in the arm's order (rad, or m on sliding joints)."""
         turning = {j for j, kind in arm.commanded.items() if kind == "angle"}
         sliding = set(arm.commanded) - turning
         for given, joints, key in ((self.levels, turning, "levels"), (self.travel, sliding, "travel")):
@@ -92,8 +88,6 @@ class ElasticArmSettings(Settings):
 
 
 class ElasticArmSimulator:
-    """The simulator ``elastic_arm``."""
-
     Settings: ClassVar[type[ElasticArmSettings]] = ElasticArmSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "truth": "truth.yaml",
@@ -107,11 +101,6 @@ class ElasticArmSimulator:
         self._settings = settings
 
     def simulate(self, request: SimulationRequest) -> Dataset:
-        """Records of the first arm's joints in random or grid poses, or in those that are requested.
-
-        Raises:
-            ConfigError: the truth names unknown parameters, or a joint has no levels.
-        """
         payloads = self._settings.payloads if request.poses is None else ()
         parts = []
         for number, payload in enumerate(payloads):
@@ -167,11 +156,7 @@ class ElasticArmSimulator:
 
 
 def _commands_in_view(true: SimulationRequest, poses: PoseSettings, arm: Arm, random: np.random.Generator) -> Array:
-    """Commands (joints x poses) in which an instrument sees something; drawn again until there are enough.
-
-    Raises:
-        ConfigError: hardly any pose is one.
-    """
+    """Commands (joints x poses) in which an instrument sees something; drawn again until there are enough."""
 
     def seen(commands: Array) -> Mask:
         if not any(isinstance(measurement, LimitedView) for measurement in true.measurements.values()):
@@ -226,8 +211,6 @@ class ContactsSettings(Settings):
 
 
 class ContactsSimulator:
-    """The simulator ``contacts``."""
-
     Settings: ClassVar[type[ContactsSettings]] = ContactsSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "truth": "truth.yaml",
@@ -241,11 +224,6 @@ class ContactsSimulator:
         self._settings = settings
 
     def simulate(self, request: SimulationRequest) -> Dataset:
-        """Postures in the order of the groups.
-
-        Raises:
-            ConfigError: the truth names unknown parameters, a measurement has no groups, or no posture reaches one.
-        """
         settings, measurements = self._settings, request.measurements
         random = np.random.default_rng(settings.seed)
         channels = [*command_channels(request.arms)]
@@ -275,7 +253,6 @@ class ContactsSimulator:
         return Dataset(ids, noisy, labels, source="simulation")
 
     def _problems(self, request: SimulationRequest) -> dict[str, Problem]:
-        """Each measurement alone, at the truth."""
         measurements = request.measurements
         groups: dict[str, tuple[str, ...]] = {}
         for instance, keys in self._settings.groups.items():
@@ -306,7 +283,6 @@ class ContactsSimulator:
     def _postures(
         self, problem: Problem, instance: str, key: str, request: SimulationRequest, random: np.random.Generator
     ) -> dict[str, Array]:
-        """Joint angles without noise (count each) of the arms that take part, in one group."""
         settings, factor = self._settings, problem.kernels[0].factor
         names = [factor.channels[i] for i in joint_channels(factor)]
         postures: dict[str, list[Array]] = {name: [] for name in names}

@@ -57,10 +57,7 @@ class TrackerSettings(Settings):
 class TrackerModel:
     """Sees bodies, in an order that its random numbers go by. The same seed, times and poses give the same frames.
 
-    Attributes:
-        hidden: bodies that it cannot see now.
-        silent: it sends nothing, while its frame counter goes on.
-        frozen: it sends the last frame again and again, with a ``rising`` counter or the ``same``.
+    ``silent``: its frame counter goes on; ``frozen``: it sends the last frame again and again.
     """
 
     def __init__(self, settings: TrackerSettings, bodies: Sequence[str], random: np.random.Generator) -> None:
@@ -73,12 +70,7 @@ class TrackerModel:
         self._shown: TrackerFrame | None = None
 
     def frame(self, now: float, bodies: Mapping[str, Array | None]) -> TrackerFrame | None:
-        """The frame of a moment; None if it never arrives.
-
-        Args:
-            now: the bench's wall clock (unix s); it must not go back.
-            bodies: ``world_T_body`` (4 x 4, m); None: out of sight.
-        """
+        """The frame of a moment (unix s), None if it never arrives, with bodies at ``world_T_body`` (4 x 4, m)."""
         elapsed = 0.0 if self._last is None else now - self._last
         self._last = now
         poses = self._seen(bodies, elapsed)
@@ -142,7 +134,6 @@ class SimulatedTracker(Tracker):
         self._under_way: deque[TrackerFrame] = deque(maxlen=_MOST_WAITING)
 
     def send(self, frame: TrackerFrame, arrives: float) -> None:
-        """A frame is on its way, until a time of the bench's clock (s)."""
         if self._clock is not None:
             self._under_way.append(replace(frame, arrived=arrives))
 
@@ -184,8 +175,6 @@ _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
 
 class FaultRequest(Settings):
-    """One fault."""
-
     kind: Literal[
         "lost", "silent", "frozen", "seen", "unplug", "replug", "reset", "brown_out", "jam", "free", "heat", "put"
     ]
@@ -219,22 +208,13 @@ class BenchTruthSettings(Settings):
     seed: Annotated[int, Field(ge=0)] = 0
 
     def servo_of(self, joint: str) -> ServoJointSettings:
-        """What kind of servo drives a joint: its own settings above those of all."""
         stated = [self.joints[name] for name in (ALL, joint) if name in self.joints]
         made = type(stated[-1]) if stated else ServoJointSettings
         return made.si(**{key: getattr(settings, key) for settings in stated for key in settings.model_fields_set})
 
 
 class TrackedArm:
-    """An arm at its true parameters, and the body on its tool that the tracker sees.
-
-    Attributes:
-        experiment: whose arm it is; ``arm``: without the effects that its servos have by themselves.
-
-    Raises:
-        ConfigError: there are several arms or measurements, the truth is refused, an effect asks for surroundings that
-            a bench does not have, or the measurement is no position.
-    """
+    """An arm at its true parameters, and the body on its tool that the tracker sees."""
 
     def __init__(self, settings: BenchTruthSettings, experiment: Experiment) -> None:
         self.experiment, system = experiment, experiment.system
@@ -263,20 +243,13 @@ class TrackedArm:
         self._deflection = np.zeros((arm.deflection_size, 1))
 
     def torques(self, angles: list[float]) -> list[float]:
-        """Holding torques (joints, N m) at joint angles (joints, rad).
-
-        They are those of the true masses on the nominal geometry, from which they hardly differ.
-        """
+        """Holding torques (joints, N m) of the true masses on the nominal geometry, from which they hardly differ."""
         self._torques.inputs[0][:] = angles
         self._torques.evaluate()
         return [float(torque) for torque in self._torques.outputs[0][0]]
 
     def pose(self, joint_angles: Array, approaches: Array) -> Array:
-        """``base_T_body`` (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1).
-
-        Raises:
-            NotConvergedError: the springs do not hold the arm there.
-        """
+        """``base_T_body`` (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1)."""
         record = np.concatenate([joint_angles, approaches])[:, None]
         try:
             shown = self._evaluator(_NO_VALUES, record, self._deflection)
@@ -325,19 +298,7 @@ class TrackedArm:
 class BenchWorld:
     """A bench: its time, and what happens in it. A subclass has what stands between host and servos.
 
-    Attributes:
-        now: simulated seconds since the bench began.
-        servos, heat, torques: by joint; torques (N m) as of the last look.
-        tracker_model: sees the bodies; ``safety``: what was unsafe.
-
-    Args:
-        settings: the truth.
-        tracked: the arm.
-        servos: by joint, in the arm's order.
-        file: the true servo file, where pulses drive servos.
-        log: the file that takes lines on what is unsafe.
-        bodies: that the tracker sees, in an order.
-        now: when time begins.
+    Torques (N m) are as of the last look; ``file`` is the true servo file, where pulses drive servos.
     """
 
     def __init__(
@@ -386,7 +347,6 @@ class BenchWorld:
         """Time has passed for the motors."""
 
     def advance(self, seconds: float) -> None:
-        """Let time pass; all that happens in it has happened then."""
         end = self.now + seconds
         self.safety.passed(self.now)
         while self.now < end:
@@ -404,16 +364,13 @@ class BenchWorld:
                 self.safety.passed(self.now)
 
     def plan(self, *faults: FaultRequest) -> None:
-        """Have them happen at their times."""
         self._faults = sorted([*self._faults, *faults], key=lambda fault: fault.at)
 
     def run_faults(self) -> None:
-        """Do those whose time has come."""
         while self._faults and self._faults[0].at <= self.now:
             self.fail(self._faults.pop(0))
 
     def fail(self, fault: FaultRequest) -> None:
-        """Do a fault: here one of the tracker."""
         tracker, bodies = self.tracker_model, {fault.body} if fault.body else set(self._bodies)
         if fault.kind == "lost":
             tracker.hidden |= bodies
@@ -426,11 +383,9 @@ class BenchWorld:
             tracker.hidden -= bodies
 
     def commands_changed(self) -> None:
-        """Servos were commanded something else, or another torque is on them."""
         self._yielding = any(servo.gives_way(self.torques[joint]) for joint, servo in self.servos.items())
 
     def state(self) -> dict[str, Any]:
-        """The truth, as JSON."""
         base_T_body = self._body_pose()
         joints = {
             joint: {
@@ -456,7 +411,6 @@ class BenchWorld:
         }
 
     def go_on(self, before: Mapping[str, Any]) -> None:
-        """From the heat and the account of a state."""
         for joint, servo in self.servos.items():
             heat, there = self.heat[joint], before["joints"][joint]
             heat.winding, heat.case, servo.failed = there["winding"], there["case"], there["failed"]
@@ -464,7 +418,6 @@ class BenchWorld:
         self.safety.go_on(before)
 
     def _move(self, seconds: float) -> None:
-        """Let the servos drive until now, and do what is due: at most one event's time at once."""
         if seconds > 0:
             moved = False
             for joint, servo in self.servos.items():
