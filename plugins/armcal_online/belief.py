@@ -22,7 +22,7 @@ import fnmatch
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from armcal.arm.evaluator import MOST_DEFLECTION
@@ -355,58 +355,32 @@ def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
 
 
 class OneRecord:
-    """A factor's residuals and Jacobians in buffers for one record or a few; not to be shared between threads.
+    """A factor's residual and Jacobian in buffers for one record; not to be shared between threads.
 
-    The compiled functions work on a whole vector of records; where there are fewer, its last places hold the last
-    one. The elastic equilibrium starts from rest each time: what comes out is a function of values and records alone,
-    to the last bit.
+    The elastic equilibrium starts from rest each time: what comes out is a function of values and record alone, to the
+    last bit.
     """
 
     def __init__(self, kernel: Kernel) -> None:
-        factor = kernel.factor
-        self._kernel = kernel
-        self._sizes = (factor.rows, factor.values.numel())
-        width = LANES if isinstance(kernel.backend, Compiled) else 1
+        factor, backend = kernel.factor, kernel.backend
+        self._kernel, self._sizes = kernel, (factor.rows, factor.values.numel())
+        counts = (len(factor.channels), factor.state.numel(), factor.rows, self._sizes[0] * self._sizes[1])
         self._values = np.zeros(self._sizes[1])
-        self._record = np.zeros((len(factor.channels), width))
-        self._state = np.zeros((factor.state.numel(), width))
-        self._residual = np.zeros((self._sizes[0], width))
-        self._jacobian = np.zeros((self._sizes[0] * self._sizes[1], width))
-        arrays, backend = (self._values, self._record, self._state, self._residual, self._jacobian), kernel.backend
-        # Evaluates these buffers again and again, and gives how many records did not settle.
-        self._evaluate: Callable[[], int] = partial(backend.linearise, *arrays)
-
-        def over_points() -> int:
-            kernel.linearise(*arrays)
-            return 0
-
-        if kernel.points is not None:
-            self._evaluate = over_points
-        elif isinstance(backend, Compiled):
-            self._evaluate = backend.prepared(*arrays)
+        # Compiled functions work on a whole vector of records.
+        lanes = LANES if isinstance(backend, Compiled) else 1
+        self._buffers = channels, state, residual, jacobian = [np.zeros((count, lanes)) for count in counts]
+        self._evaluate: Callable[[], int] | None = None  # gives how many records did not settle
+        if isinstance(backend, Compiled) and kernel.points is None:
+            self._evaluate = backend.prepared(self._values, channels, state, residual, jacobian)
 
     def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
-        residuals, jacobians = self.linearise_several(values, record[None])
-        return residuals[0], jacobians[0]
-
-    def linearise_several(self, values: Array, records: Array) -> tuple[Array, Array]:
-        """Residuals (k x n_r) and their Jacobians (k x n_r x n_v) of records (k x n_c), in equilibrium."""
-        count, width = len(records), self._record.shape[1]
-        residuals, jacobians = np.empty((count, self._sizes[0])), np.empty((count, *self._sizes))
-        self._values[:] = values
-        for start in range(0, count, width):
-            part = records[start : start + width]
-            self._record[:] = part[-1][:, None]
-            self._record[:, : len(part)] = part.T
-            self._state[:] = 0.0
-            if self._evaluate() or not np.abs(self._state).max(initial=0.0) <= MOST_DEFLECTION:
-                # The rare way: Newton, arranged for many records.
-                self._state[:] = 0.0
-                self._kernel.linearise(self._values, self._record, self._state, self._residual, self._jacobian)
-            done = slice(start, start + len(part))
-            residuals[done] = self._residual.T[: len(part)]
-            jacobians[done] = self._jacobian.T[: len(part)].reshape(-1, *self._sizes)
-        return residuals, jacobians
+        """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium."""
+        channels, state, residual, jacobian = self._buffers
+        self._values[:], channels[:], state[:] = values, record[:, None], 0.0
+        if self._evaluate is None or self._evaluate() or not np.abs(state).max(initial=0.0) <= MOST_DEFLECTION:
+            state[:] = 0.0
+            self._kernel.linearise(self._values, channels, state, residual, jacobian)
+        return residual[:, 0].copy(), jacobian[:, 0].reshape(self._sizes).copy()
 
 
 JointNoise = tuple[Array | None, ...]
@@ -443,7 +417,7 @@ class Observer:
         self._noise, self._defaults, self._unfound = noise, defaults, frozenset(unfound)
         factors = [kernel.factor for kernel in problem.kernels]
         self._freedoms = [freedoms[factor.name] for factor in factors]
-        self._one_record = [OneRecord(kernel) for kernel in problem.kernels]
+        self._ones = [OneRecord(kernel) for kernel in problem.kernels]
         self._plain = [grouped.entries[0] if grouped.is_plain else None for grouped in problem.grouped]
         self.shifts = [gauss_markov.shifts(factor.name, factor.rows) for factor in factors]
         self.drifts, self.noisy_drifts = gauss_markov.drifts, noisy.drifts
@@ -518,26 +492,16 @@ class Observer:
 
     def linearise(self, values: Array, reading: Reading) -> tuple[Array, Array]:
         """Innovation (n_r) and the prediction's derivative by scaled coordinates (n_r x n), within the domains."""
-        innovations, slopes = self.linearise_several(values, [reading])
-        return innovations[0], slopes[0]
-
-    def linearise_several(self, values: Array, readings: Sequence[Reading]) -> tuple[Array, Array]:
-        """The same of readings of one factor (k x n_r, k x n_r x n)."""
-        factor, count = readings[0].factor, len(readings)
-        grouped, evaluator, entries = self.problem.grouped[factor], self._one_record[factor], self._plain[factor]
-        records = np.array([reading.record for reading in readings])
+        factor = reading.factor
+        grouped, evaluator, entries = self.problem.grouped[factor], self._ones[factor], self._plain[factor]
         if entries is not None:
-            residual, jacobian = evaluator.linearise_several(values[entries], records)
+            innovation, jacobian = evaluator.linearise(values[entries], reading.record)
         else:
-            rows, groups = grouped.kernel.factor.rows, np.array([reading.group for reading in readings])
-            residual, jacobian = np.zeros((count, rows)), np.zeros((count, rows, grouped.width))
-            for group in np.unique(groups).tolist():
-                at = np.flatnonzero(groups == group)
-                residual[at], own = evaluator.linearise_several(grouped.values(values, group), records[at])
-                moving: Indices = np.flatnonzero(grouped.free[group] != HELD)
-                jacobian[np.ix_(at, np.arange(rows), grouped.free[group][moving])] = own[:, :, moving]
-        slope = -self.space.by_coordinates(values, jacobian.reshape(-1, jacobian.shape[2]))
-        return residual, slope.reshape(*jacobian.shape[:2], -1)
+            innovation, own = evaluator.linearise(grouped.values(values, reading.group), reading.record)
+            jacobian = np.zeros((len(innovation), grouped.width))
+            moving = np.flatnonzero(grouped.free[reading.group] != HELD)
+            jacobian[:, grouped.free[reading.group][moving]] = own[:, moving]
+        return innovation, -self.space.by_coordinates(values, jacobian)
 
     def observation(self, belief: Belief, readings: tuple[Reading, ...], noise: JointNoise = ()) -> RecordObservation:
         return RecordObservation(self, belief.origin, belief.gaussian.mean, readings, noise)
@@ -563,29 +527,24 @@ class RecordObservation(Observation):
     def at(self, point: Array) -> Linearised:
         key = point.tobytes()
         if key not in self._last:
-            inside, outside = self._place(point)
-            evaluated = [self.observer.linearise(inside, reading) for reading in self.readings]
             self._last.clear()
-            self._last[key] = self._assembled(point, outside, evaluated)
+            self._last[key] = self._linearised(point)
         return self._last[key]
 
-    def _place(self, point: Array) -> tuple[Array, Array]:
+    def _linearised(self, point: Array) -> Linearised:
         observer, space = self.observer, self.observer.space
         n = len(space.scales)
         which, coordinate, size = observer.drifts
-        moved = point[:n] - self.base[:n]
+        moved, beside, outside = point[:n] - self.base[:n], point[n:], self.base[:n]
         if len(which):
-            np.add.at(moved, coordinate, size * point[n:][which])
+            np.add.at(moved, coordinate, size * beside[which])
         values = space.moved(self.origin, moved)
         inside = space.inside(values)
-        return inside, self.base[:n] if (inside == values).all() else self.base[:n] + space.between(inside, values)
-
-    def _assembled(self, point: Array, outside: Array, evaluated: Sequence[tuple[Array, Array]]) -> Linearised:
-        observer = self.observer
-        beside = point[len(observer.space.scales) :]
-        which, coordinate, size = observer.drifts
+        if not (inside == values).all():
+            outside = outside + space.between(inside, values)
         innovations, slopes, drifting = [], [], []
-        for reading, (innovation, slope) in zip(self.readings, evaluated, strict=True):
+        for reading in self.readings:
+            innovation, slope = observer.linearise(inside, reading)
             innovation = innovation - slope @ outside
             if len(observer.noisy_drifts[1]):
                 drifting.append(slope[:, observer.noisy_drifts[1]] * observer.noisy_drifts[2])
@@ -598,31 +557,8 @@ class RecordObservation(Observation):
             slopes.append(slope)
         added = self.joint_noise or (None,) * len(self.readings)
         noises = [r.noise if a is None else r.noise + a for r, a in zip(self.readings, added, strict=True)]
-        single = len(noises) == 1
-        noise = noises[0] if single else block_diag(*noises)
+        noise = noises[0] if len(noises) == 1 else block_diag(*noises)
         if drifting:
             drifted = np.vstack(drifting)
             noise = noise + drifted @ drifted.T
-        if single:
-            return Linearised(innovations[0], slopes[0], noise)
         return Linearised(np.concatenate(innovations), np.vstack(slopes), noise)
-
-
-def linearised(observations: Sequence[RecordObservation], points: Sequence[Array]) -> list[Linearised]:
-    """Records of one belief, each at a point; where these are the same values, they are evaluated together."""
-    distinct = {id(point): point for point in points}
-    known = {key: observations[0]._place(point) for key, point in distinct.items()}
-    places = [known[id(point)] for point in points]
-    inside, observer = places[0][0], observations[0].observer
-    if not all(other is inside or np.array_equal(other, inside) for other, _ in places):
-        return [one.at(point) for one, point in zip(observations, points, strict=True)]
-    evaluated: list[list[tuple[Array, Array]]] = [[] for _ in observations]
-    for factor in range(len(observer.problem.kernels)):
-        # The readings of a record are in the order of the factors.
-        of = [(i, r) for i, one in enumerate(observations) for r in one.readings if r.factor == factor]
-        if of:
-            innovations, slopes = observer.linearise_several(inside, [reading for _, reading in of])
-            for (i, _), innovation, slope in zip(of, innovations, slopes, strict=True):
-                evaluated[i].append((innovation, slope))
-    made = zip(observations, points, places, evaluated, strict=True)
-    return [one._assembled(point, outside, own) for one, point, (_, outside), own in made]

@@ -83,51 +83,6 @@ def together_decisions(
     return tuple(decisions)
 
 
-def slow_decision(
-    change: Hypothesis, size: Size, since: int, records: int, log_odds: float, next_likeliest: str
-) -> Decision:
-    why = f"no single one of the {records} records since shows it, but all of them together do"
-    why += f"; the next likeliest is {spoken(next_likeliest)}" if next_likeliest else ""
-    return Decision(change.kind, _happened(change, size), why, log_odds, since, change.subject, (change.subject,), size)
-
-
-def unnamed_decision(candidates: Sequence[str], since: int, records: int, log_odds: float, factor: float) -> Decision:
-    what = f"Something moves more than stated: {_or(candidates)}"
-    why = (
-        f"no single one of the {records} records since shows it, but all of them together do, and they fit these about "
-        f"equally; all standard deviations are made {factor:g} times larger"
-    )
-    return Decision("drift", what, why, log_odds, since, "", tuple(candidates))
-
-
-def named_decision(state: State, change: Hypothesis, others: Sequence[str], margin: float, size: Size) -> Decision:
-    """Which of several it was; without others, that a joint which stepped acts like a new servo."""
-    about = (margin, state.suspected, change.subject, (change.subject,), size)
-    if others and change.kind.startswith("joint"):
-        why = f"the records since do not fit a change of {_or(others)} as well, which is as before"
-        return Decision("joint_named", f"It was joint {change.subject} that stepped, by {size.shown}", why, *about)
-    better = f"a change of {_or(others)}, which is as before" if others else "a slip alone"
-    return Decision(change.kind, _happened(change, size), f"the records since fit this better than {better}", *about)
-
-
-def drift_decision(state: State, count: int, ratio: float, by_chance: float, factor: float) -> Decision:
-    what = f"The last {count} records miss by more than stated, although no single one does by much"
-    why = (
-        f"their mean normalised innovation squared is {ratio:.1f} times what chance makes it; parameters move faster "
-        f"than stated, or the instrument is worse; all standard deviations are made {factor:.1f} times larger"
-    )
-    return Decision("drift", what, why, log_odds_of(by_chance), first_of(state, count))
-
-
-def unexplained_decision(state: State, rejected: int, by_chance: float, best: Explanation) -> Decision:
-    what = f"{rejected} of the last {len(state.recent)} records do not fit, and no change explains them yet"
-    why = (
-        f"outliers alone are rarely so many; the likeliest change is {_named(best.hypothesis)} "
-        f"({per_cent(best.log_odds):.0f} %)"
-    )
-    return Decision("unexplained", what, why, log_odds_of(by_chance), _first_rejected(state))
-
-
 def unfit_decision(state: State, steps: Steps, why: str, log_odds: float, since: int | None = None) -> Decision:
     unfollowed = f"; steps of {', '.join(steps.unfollowed)} cannot be followed" if steps.unfollowed else ""
     first = _first_rejected(state) if since is None else since
@@ -288,7 +243,12 @@ class Judge:
             return state, (unfit_decision(state, self._steps, text, log_odds_of(by_chance)),)
         if rejected < gate.rejected or by_chance >= settings.probability:
             return state, ()
-        return state, (unexplained_decision(state, rejected, by_chance, best),)
+        what = f"{rejected} of the last {len(state.recent)} records do not fit, and no change explains them yet"
+        why = (
+            f"outliers alone are rarely so many; the likeliest change is {_named(best.hypothesis)} "
+            f"({per_cent(best.log_odds):.0f} %)"
+        )
+        return state, (Decision("unexplained", what, why, log_odds_of(by_chance), _first_rejected(state)),)
 
     def _outliers(self, state: State) -> float:
         """The share of wrong records: as stated, or more where records before the last ones had more."""
@@ -358,10 +318,11 @@ class Judge:
             if change.subject in subjects and change.subject and change.scale == 1.0
         )
         suspects = suspects if len(suspects) > 1 else ()
-        after = state.following(
-            belief,
+        after = replace(
+            state,
+            belief=belief,
             recent=(),
-            nis_window=(),
+            nis=(),
             drifted=0,
             wary=False,
             suspects=suspects,
@@ -400,32 +361,45 @@ class Judge:
         if not others and change.kind != "joint_replaced":
             return settled, ()
         left = tuple(candidate for candidate in followed if candidate not in others) if others else ()
-        after = settled.following(best.belief, recent=(), wary=False)
+        after = replace(settled, belief=best.belief, recent=(), wary=False)
         if len(left) > 1:
             after = replace(after, suspects=left, before_change=state.before_change)
         size = self._size(state.before_change or best.belief, best.belief, change)
-        names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
-        return after, (named_decision(state, change, names, margin, size),)
+        about = (margin, state.suspected, change.subject, (change.subject,), size)
+        names = _or(list(dict.fromkeys(self._changes[other.place].subject for other in others)))
+        if others and change.kind.startswith("joint"):
+            why = f"the records since do not fit a change of {names} as well, which is as before"
+            what = f"It was joint {change.subject} that stepped, by {size.shown}"
+            return after, (Decision("joint_named", what, why, *about),)
+        better = f"a change of {names}, which is as before" if others else "a slip alone"
+        why = f"the records since fit this better than {better}"
+        return after, (Decision(change.kind, _happened(change, size), why, *about),)
 
     def _detect_drift(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         settings = self._settings.levels
-        if len(state.nis_window) < settings.window:
+        if len(state.nis) < settings.window:
             return state, ()
         known = min(map(self._filter.freedom, state.recent), default=math.inf)
-        by_chance = improbability(state.nis_window, known)
+        by_chance = improbability(state.nis, known)
         if by_chance >= settings.probability:
-            return replace(state, drifted=0, nis_window=state.nis_window[settings.window // 2 :]), ()
-        total, freedom = (float(sum(column)) for column in zip(*state.nis_window, strict=True))
-        ratio, count = total / freedom, len(state.nis_window)
-        state = replace(state, nis_window=(), drifted=state.drifted + 1)
+            return replace(state, drifted=0, nis=state.nis[settings.window // 2 :]), ()
+        total, freedom = (float(sum(column)) for column in zip(*state.nis, strict=True))
+        ratio, count = total / freedom, len(state.nis)
+        state = replace(state, nis=(), drifted=state.drifted + 1)
         if state.drifted >= _UNEXPLAINED:
             text = f"the NIS of {count} records is {ratio:.1f} times what chance makes it, again and again"
             since = first_of(state, _UNEXPLAINED * count)
             return state, (unfit_decision(state, self._steps, text, log_odds_of(by_chance), since),)
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
         belief = state.belief.widened(len(self._space.scales), factor)
-        decision = drift_decision(state, count, ratio, by_chance, factor)
-        return state.following(belief), (decision,)
+        what = f"The last {count} records miss by more than stated, although no single one does by much"
+        why = (
+            f"their mean normalised innovation squared is {ratio:.1f} times what chance makes it; parameters move "
+            "faster than stated, or the instrument is worse; "
+            f"all standard deviations are made {factor:.1f} times larger"
+        )
+        decision = Decision("drift", what, why, log_odds_of(by_chance), first_of(state, count))
+        return replace(state, belief=belief), (decision,)
 
     def _detect_slow(self, state: State) -> tuple[State, tuple[Decision, ...]]:
         weighings, settings = self._slow.weighed(state.slow), self._settings.changes
@@ -435,13 +409,17 @@ class Judge:
         near = [one for one in weighings if best.log_odds - one.log_odds < odds]
         others = [one.log_odds for one in weighings if one not in near]
         log_odds = float(logsumexp([one.log_odds for one in near]) - logsumexp([0.0, *others]))
-        about = (best.track.since, best.track.records, log_odds)
+        why = f"no single one of the {best.track.records} records since shows it, but all of them together do"
+        since = best.track.since
         if len(near) > 1 and not self._slow.is_due(best):
             return state, ()
         if len(near) > 1:
             belief = state.belief.widened(len(self._space.scales), _UNNAMED)
-            decision = unnamed_decision([one.change.subject for one in near], *about, _UNNAMED)
-            return state.following(belief), (decision,)
+            candidates = tuple(one.change.subject for one in near)
+            what = f"Something moves more than stated: {_or(candidates)}"
+            why += f", and they fit these about equally; all standard deviations are made {_UNNAMED:g} times larger"
+            decision = Decision("drift", what, why, log_odds, since, "", candidates)
+            return replace(state, belief=belief), (decision,)
         slow, belief = self._slow.followed(state.slow, best, state.belief)
         is_gradual = best.change.kind in GRADUAL
         size = (
@@ -449,8 +427,12 @@ class Judge:
             if is_gradual
             else self._size(state.belief, belief, best.change)
         )
-        decision = slow_decision(best.change, size, *about, weighings[1].change.subject if len(weighings) > 1 else "")
-        return state.following(belief, recent=(), nis_window=(), slow=slow), (decision,)
+        why += f"; the next likeliest is {spoken(weighings[1].change.subject)}" if len(weighings) > 1 else ""
+        subject = best.change.subject
+        decision = Decision(
+            best.change.kind, _happened(best.change, size), why, log_odds, since, subject, (subject,), size
+        )
+        return replace(state, belief=belief, recent=(), nis=(), slow=slow), (decision,)
 
     def _size(self, before: Belief, after: Belief, change: Hypothesis) -> Size:
         return size_of(self._space, self._steps, before, after, change)

@@ -47,7 +47,7 @@ class Progress:
     records: int = 0  # how many records were journalled, from the beginning
     paused: bool = False
     positions: dict[str, int] = field(default_factory=dict)  # the last row taken, by file
-    recent: dict[str, int] = field(default_factory=dict)  # sequence numbers of the last records of streams
+    recent: dict[str, int] = field(default_factory=dict)  # sequence numbers of the last records
 
     def take(self, incoming: Incoming, sequence: int) -> None:
         self.records += 1
@@ -56,13 +56,13 @@ class Progress:
             self.positions[key] = max(self.positions.get(key, 0), incoming.source_row)
             if len(self.positions) > MAX_FILES:
                 del self.positions[next(iter(self.positions))]
-        elif not incoming.fault:
+        if not incoming.fault:
             self.recent[_mark(incoming)] = sequence
             if len(self.recent) > RECENT:
                 del self.recent[next(iter(self.recent))]
 
     def repeated(self, incoming: Incoming) -> int | None:
-        return None if incoming.source_key or incoming.fault else self.recent.get(_mark(incoming))
+        return None if incoming.fault else self.recent.get(_mark(incoming))
 
 
 def _mark(incoming: Incoming) -> str:
@@ -103,9 +103,10 @@ class StateReplayer:
     def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
         if kind == RECORD:
             incoming = Incoming.from_dict(content)
+            repeated = self.progress.repeated(incoming) is not None
             self.progress.take(incoming, sequence)
-            why = "The recalibration is paused."
-            if not self.progress.paused:
+            why = "Passed over: the same record came before." if repeated else "The recalibration is paused."
+            if not repeated and not self.progress.paused:
                 try:
                     return self._session.take(incoming, sequence)
                 except ArmcalError as fault:
@@ -364,9 +365,8 @@ class Recalibration:
         return {**reply, "fault": incoming.fault} if incoming.fault else reply
 
     def _take(self, incoming: Incoming) -> int:
-        earlier = self._replayer.progress.repeated(incoming)
-        if earlier is not None:
-            return earlier
+        if not incoming.source_key and (earlier := self._replayer.progress.repeated(incoming)) is not None:
+            return earlier  # it was acknowledged before
         content = incoming.as_dict()
         self.sequence = self._journal.record(RECORD, content)
         events = self._replayer.apply(self.sequence, RECORD, content)

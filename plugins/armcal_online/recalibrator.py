@@ -7,8 +7,6 @@ An event is a JSON object, with a finished sentence wherever something was decid
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -46,7 +44,6 @@ from armcal_online.state import (
     Health,
     State,
     Tick,
-    advanced,
     calibration_text,
     deviations,
     filter_setup,
@@ -58,6 +55,7 @@ from armcal_online.state import (
 from armcal_online.window_evidence import SHOWN, HypothesisFilter, TipError, in_model_errors, tip_error
 
 _WEEK = 7.0  # days
+_REFRESHED = 25  # after so many accepted records the origin is put where it is most likely within the bounds
 _FARTHEST = 100.0  # rad or m; a joint beyond it is a fault of the record
 
 
@@ -125,14 +123,8 @@ class Recalibrator:
         """The state with the record known, and why it is passed over, if it is."""
         if incoming.fault:
             return state, incoming.fault
-        # Where and when a record arrived does not make it another.
-        content = incoming.as_dict()
-        identifying = json.dumps([content["id"], content["channels"], content["labels"]], sort_keys=True)
-        mark = hashlib.sha256(identifying.encode()).hexdigest()[:12]
-        if any((known.record_id, known.content) == (incoming.record_id, mark) for known in state.ids):
-            return state, "the same record came before"
         at = incoming.arrived if time is None else time
-        state = remembering(state, Arrival(incoming.record_id, mark, state.sequence, at))
+        state = remembering(state, Arrival(incoming.record_id, state.sequence, at))
         if tick.stale:
             return replace(state, clock=tick.clock), tick.stale
         state = replace(state, at=at)
@@ -194,18 +186,22 @@ class Recalibrator:
         """The state with a record, accepted or rejected; the record at its prior mean, and the limit of its NIS."""
         observer, space, before = self.setup.observer, self.setup.space, state.belief
         noise = observer.joint_noise(space.inside(before.values(space)), readings)
-        first = observer.observation(before, readings, noise).at(before.gaussian.mean)
+        observation = observer.observation(before, readings, noise)
+        first = observation.at(before.gaussian.mean)
         covariance = first.slope @ before.gaussian.covariance @ first.slope.T + first.noise
         nis, dof = normalised_innovation_squared(first.innovation, covariance), len(first.innovation)
         limit = nis_limit(dof, self.settings.gate.probability, observer.freedom(readings))
         rejected = self.settings.gating and not nis <= limit
         recent = Recent(state.sequence, readings, noise, passed, before, rejected, nis, dof)
-        nis_window = self.settings.levels.window
-        after = state if rejected else advanced(state, recent, self.setup, self._estimator, nis_window)
+        counted = _counted(state, "rejected" if rejected else "accepted")
         if not rejected:
+            belief = before.updated(space, self._estimator.update(before.gaussian, observation).posterior)
+            if counted.counts["accepted"] % _REFRESHED == 0:
+                # Where bounds hold, steps of the mean lead the origin astray slowly.
+                belief = belief.about(space, most_likely(space, belief))
             slow = self._slow.after(state.slow, state.sequence, before.gaussian, first, covariance)
-            after = replace(after, slow=slow)
-        counted = _counted(after, "rejected" if rejected else "accepted")
+            nis_window = (*state.nis, (nis, dof))[-self.settings.levels.window :]
+            counted = replace(counted, belief=belief, slow=slow, nis=nis_window)
         return replace(counted, recent=(*counted.recent, recent)[-self.settings.gate.window :]), first, limit
 
     def _record_event(

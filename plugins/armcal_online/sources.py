@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 from zlib import crc32
@@ -50,20 +51,11 @@ _MARK = b"\xef\xbb\xbf"  # of byte order
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a record came from: the file in its source, the row in that, and when (unix seconds, our clock)."""
-
-    source_key: str = ""
-    row: int = 0
-    arrived: float = field(default_factory=lambda: time.time())
-
-
-@dataclass(frozen=True)
 class Incoming:
-    record_id: str  # its id; the row where its source gives none
-    channels: Mapping[str, float]
-    labels: Mapping[str, str]  # text columns that no channel claims (a socket's name)
-    arrived: float  # unix seconds, by our clock
+    record_id: str = ""  # its id; the row where its source gives none
+    channels: Mapping[str, float] = field(default_factory=dict)  # SI numbers, NaN where missing (``arm.q1``, ``time``)
+    labels: Mapping[str, str] = field(default_factory=dict)  # text columns that no channel claims (a socket's name)
+    arrived: float = field(default_factory=lambda: time.time())  # unix seconds, by our clock
     source_key: str = ""  # the file within the source, or empty
     source_row: int = 0  # the row in it, from 1 (the line in a text file)
     fault: str = ""  # why it could not be read, a sentence; there are no channels then
@@ -120,41 +112,36 @@ class RowParser:
         self._wanted = request.channels
         self._optional = tuple(replace(channel, required=False) for channel in request.channels)
         self._columns = dict(columns)
-        self._plans: dict[tuple[str, ...], Plan | str] = {}
+        self._plan = lru_cache(_PLANS)(self._plan_of)
 
     def table(self, line: str, source: str, number: int) -> tuple[LineTable, Plan]:
         lines = LineTable.begun(line, source, number)
         header = renamed(header_of(lines.header, source, number), self._columns)
         return lines, self._matched(header)
 
-    def row(self, table: LineTable, plan: Plan, line: str, place: Place) -> Incoming:
-        return self._record(plan, table.row(line, place.row), place)
+    def row(self, table: LineTable, plan: Plan, line: str, blank: Incoming) -> Incoming:
+        return self._record(plan, table.row(line, blank.source_row), blank)
 
-    def json_text(self, text: str, place: Place) -> Incoming:
+    def json_text(self, text: str, blank: Incoming) -> Incoming:
         try:
-            fields = json.loads(text, object_pairs_hook=_without_repeats)
+            fields = json.loads(text)
         except (ValueError, RecursionError) as fault:
-            return faulty(place, f"It is not JSON ({_short(str(fault), 120)}).")
-        return self.object(fields, place)
+            return faulty(blank, f"It is not JSON ({_short(str(fault), 120)}).")
+        return self.object(fields, blank)
 
-    def object(self, fields: Any, place: Place) -> Incoming:
+    def object(self, fields: Any, blank: Incoming) -> Incoming:
         if not isinstance(fields, dict):
             text = "an array" if isinstance(fields, list) else _short(json.dumps(fields), 40)
-            return faulty(place, f"Found {text}, expected a JSON object.")
-        names = tuple(fields)
-        if names not in self._plans:
-            if len(self._plans) >= _PLANS:
-                self._plans.clear()
-            own = {name: column for name, column in self._columns.items() if column in names}
-            try:
-                header = renamed(header_of(names, "", None) if names else Header("", None, ()), own)
-                self._plans[names] = self._matched(header)
-            except DataError as fault:
-                self._plans[names] = str(fault)
-        plan = self._plans[names]
-        if isinstance(plan, str):
-            return faulty(place, plan)
-        return self._record(plan, list(fields.values()), place)
+            return faulty(blank, f"Found {text}, expected a JSON object.")
+        plan = self._plan(tuple(fields))
+        return faulty(blank, plan) if isinstance(plan, str) else self._record(plan, list(fields.values()), blank)
+
+    def _plan_of(self, names: tuple[str, ...]) -> Plan | str:
+        own = {name: column for name, column in self._columns.items() if column in names}
+        try:
+            return self._matched(renamed(header_of(names, "", None) if names else Header("", None, ()), own))
+        except DataError as fault:
+            return str(fault)
 
     def _matched(self, header: Header) -> Plan:
         plan = match_columns(header, self._optional)
@@ -177,16 +164,16 @@ class RowParser:
         nearest = min(by_part.values(), key=len, default=[])
         return nearest[0] if nearest else None
 
-    def _record(self, plan: Plan, cells: Sequence[Any], place: Place) -> Incoming:
+    def _record(self, plan: Plan, cells: Sequence[Any], blank: Incoming) -> Incoming:
         labels = {
             _clean(column.known_as[:MAX_LABEL]): text
             for column in plan.extra[:MAX_LABELS]
             if (text := _text(cells[column.index])) and len(text) <= MAX_LABEL
         }
-        text = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(place.row)
+        text = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(blank.source_row)
         record_id = _short(text, MAX_ID)
         if not record_id:
-            return faulty(place, "Its id is empty.")
+            return faulty(blank, "Its id is empty.")
         channels: dict[str, float] = {}
         for channel, (column, unit) in plan.channels.items():
             try:
@@ -195,15 +182,13 @@ class RowParser:
                     refuse("", f"found the approach {number:g}, expected -1, 0 or 1.", "", column=column.name)
             except DataError as fault:
                 sentence = f"{_short(column.name, MAX_ID)}: {fault.message} {fault.hint}".rstrip()
-                return replace(faulty(place, sentence), record_id=record_id)
+                return replace(faulty(blank, sentence), record_id=record_id)
             channels[channel] = from_unit(number, unit)
-        return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)
+        return replace(blank, record_id=record_id, channels=channels, labels=labels)
 
 
-def faulty(place: Place, sentence: str) -> Incoming:
-    return Incoming(
-        str(place.row), {}, {}, place.arrived, place.source_key, place.row, _short(_clean(sentence), MAX_FAULT)
-    )
+def faulty(blank: Incoming, sentence: str) -> Incoming:
+    return replace(blank, record_id=str(blank.source_row), fault=_short(_clean(sentence), MAX_FAULT))
 
 
 def _number(value: Any, name: str) -> float:
@@ -233,15 +218,6 @@ def _clean(text: str) -> str:
 
 def _short(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
-
-
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if len(fields) != len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{_short(twice, 40)} is given twice")
-    return fields
 
 
 class Lines(Source):
@@ -279,8 +255,7 @@ class Lines(Source):
 
     @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        # Keys of earlier versions begin with the name of the file.
-        self._positions = {key.rpartition("#")[2]: row for key, row in positions.items()}
+        self._positions = dict(positions)
 
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
@@ -298,7 +273,7 @@ class Lines(Source):
                 data = os.read(self._descriptor, _CHUNK)
             except OSError as fault:
                 self.ended = True
-                return faulty(Place(self._key, self._row), f"The source cannot be read on ({fault.strerror}).")
+                return faulty(self._blank(self._row), f"The source cannot be read on ({fault.strerror}).")
             self._is_at_end = not data
             self._lines.extend(self._cutter.feed(data))
         return None
@@ -309,12 +284,15 @@ class Lines(Source):
         if self._file is not None:
             self._file.close()
 
+    def _blank(self, row: int) -> Incoming:
+        return Incoming(source_key=self._key, source_row=row)
+
     def _last(self) -> Incoming | None:
         if not self._cutter.begun:
             return None
         if self.keeps_records:
             return self._record(self._cutter.rest())
-        return faulty(Place(self._key, self._row + 1), "The last line has no end: it may have been cut short.")
+        return faulty(self._blank(self._row + 1), "The last line has no end: it may have been cut short.")
 
     def _record(self, line: bytes | None) -> Incoming | None:
         """The record in a line (None: one that was too long); None where it holds none, or was taken before."""
@@ -331,21 +309,21 @@ class Lines(Source):
             self._through = self._positions.get(self._key, 0)
         if self._row <= self._through:
             return None
-        place = Place(self._key, self._row)
+        blank = self._blank(self._row)
         if line is None:
-            return faulty(place, "The line has more than 1 MiB, expected a record.")
+            return faulty(blank, "The line has more than 1 MiB, expected a record.")
         try:
             text = text_of(line, self._name, SAVE_AS_TEXT, self._row)
             if bare.startswith(b"{"):
-                return self._rows.json_text(text, place)
+                return self._rows.json_text(text, blank)
             if self._table is not None:
-                return self._rows.row(*self._table, text, place)
+                return self._rows.row(*self._table, text, blank)
         except DataError as fault:
-            return faulty(place, f"{fault.message[:1].upper()}{fault.message[1:]} {fault.hint}")
+            return faulty(blank, f"{fault.message[:1].upper()}{fault.message[1:]} {fault.hint}")
         try:
             self._table, self._header = self._rows.table(text, self._name, self._row), bare
         except DataError as fault:
-            return faulty(place, str(fault))
+            return faulty(blank, str(fault))
         return None
 
 
@@ -363,7 +341,7 @@ class Sent(Source):
 
     def received(self, fields: Mapping[str, Any]) -> Incoming:
         self._row += 1
-        return self._rows.object(dict(fields), Place("", self._row))
+        return self._rows.object(dict(fields), Incoming(source_row=self._row))
 
 
 def open_source(text: str, rows: RowParser) -> Source:

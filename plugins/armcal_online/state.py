@@ -30,7 +30,7 @@ from armcal.calibration.intervals import covariance_rows
 from armcal.config.selection import quantity
 from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import interval
-from armcal.estimate.online import Gaussian, OnlineEstimator
+from armcal.estimate.online import Gaussian
 from armcal.measure.groups import PairedMeasurement
 from armcal.measure.measurement import Measurement
 from armcal.measure.reader import ReadRequest, requested_channels
@@ -390,8 +390,7 @@ def improbability(nis_window: Sequence[tuple[float, int]], known: float = math.i
     return float(fdtrc(freedom / shared, known, total / freedom))
 
 
-REMEMBERED = 128  # so many records are remembered: to know one that comes twice, and to name the first after a change
-_REFRESHED = 25  # after so many accepted records the origin is put where it is most likely within the bounds
+REMEMBERED = 128  # so many records are remembered, to name the first after a change
 
 
 @dataclass(frozen=True)
@@ -440,7 +439,6 @@ def _span(seconds: float) -> str:
 @dataclass(frozen=True)
 class Arrival:
     record_id: str  # its own name
-    content: str  # a hash of it
     sequence: int  # its number
     at: float  # its time (as ``State.at``)
     is_good: bool = False  # whether it was accepted, nothing was decided, and the level was nominal after it
@@ -455,7 +453,7 @@ class State:
     clock: Clock = field(default_factory=Clock)  # by records
     place: float | None = None  # the last record's ``sequence``; None before the first
     health: Health = field(default_factory=Health)  # and why
-    nis_window: tuple[tuple[float, int], ...] = ()  # NIS and degrees of freedom of the last accepted records
+    nis: tuple[tuple[float, int], ...] = ()  # NIS and degrees of freedom of the last accepted records
     counts: Mapping[str, int] = field(
         default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0}
     )  # of records
@@ -473,9 +471,6 @@ class State:
     at: float = 0.0  # time of the last record (unix seconds, or as records count it)
     slow: SlowState = field(default_factory=SlowState)  # evidence of slow changes, and trends that were found
 
-    def following(self, belief: Belief, **changes: Any) -> State:
-        return replace(self, belief=belief, **changes)
-
     def known(self, sequence: int) -> Arrival | None:
         return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
 
@@ -484,13 +479,11 @@ class State:
         return next(earlier, self.good if self.good is not None and self.good.sequence < sequence else None)
 
     def as_dict(self) -> dict[str, Any]:
-        content = _encoded(self)
-        content["nis"] = content.pop("nis_window")
-        return dict(content)
+        return dict(_encoded(self))
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> State:
-        state: State = _decoded(cls, {**content, "nis_window": content["nis"]})
+        state: State = _decoded(cls, content)
         if set(state.counts) != {"accepted", "rejected", "ignored"}:
             raise ValueError(f"counts of {', '.join(state.counts)}")
         return state
@@ -550,13 +543,3 @@ def _decoded(kind: Any, content: Any) -> Any:
     if origin is Literal and content not in parts:
         raise ValueError(f"{content!r} is none of {', '.join(parts)}")
     return content if origin is Literal else kind(content)
-
-
-def advanced(state: State, recent: Recent, setup: FilterSetup, estimator: OnlineEstimator, nis_window: int) -> State:
-    space, before = setup.space, state.belief
-    observation = setup.observer.observation(before, recent.readings, recent.joint_noise)
-    belief = before.updated(space, estimator.update(before.gaussian, observation).posterior)
-    if state.counts["accepted"] % _REFRESHED == _REFRESHED - 1:
-        # Where bounds hold, steps of the mean lead the origin astray slowly.
-        belief = belief.about(space, most_likely(space, belief))
-    return replace(state, belief=belief, nis_window=(*state.nis_window, (recent.nis, recent.dof))[-nis_window:])

@@ -19,7 +19,7 @@ from armcal.estimate.validation import error_dimension, error_unit
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dposv
 
-from armcal_online.belief import Belief, Observer, ProcessNoise, StateSpace, linearised
+from armcal_online.belief import Belief, Observer, ProcessNoise, StateSpace
 from armcal_online.hypotheses import Candidate, Explanation, Hypothesis, Recent, Steps
 from armcal_online.settings import OutlierSettings
 
@@ -290,7 +290,7 @@ class RecordsSince:
         self._left = np.ones((count, count, len(gaussian.mean) - self._n))
         for i, j in combinations(range(count), 2):
             self._left[i, j] = np.prod(kept[i:j], axis=0)
-        self._unmoved = linearised(self._observations, self._means)
+        self._unmoved = [one.at(mean) for one, mean in zip(self._observations, self._means, strict=True)]
         self._roots: dict[tuple[bytes, float], tuple[Array, bool]] = {}
         # An outlier says nothing about the arm: its density is the same whatever has changed.
         self._log_outliers = (
@@ -325,8 +325,7 @@ class RecordsSince:
         if not shift.any():
             return self._unmoved
         moved = directions @ shift
-        points = {id(mean): mean + moved for mean in self._means}
-        return linearised(self._observations, [points[id(mean)] for mean in self._means])
+        return [one.at(mean + moved) for one, mean in zip(self._observations, self._means, strict=True)]
 
     def _likeliest_shift(self, directions: Array, shift: Array, fits: Mask, factor: float) -> Array:
         """By the records that fit (k; in standard deviations), weighted as without the change."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -103,6 +104,16 @@ def test_a_record_that_the_recalibrator_refuses_is_passed_over_for_good(tmp_path
     fake = run(folder, Listed(records))
     (ignored,) = [e for e in events(folder) if e.get("verdict") == "ignored"]
     assert "it is refused" in ignored["why"] and fake.count == 7 and replayed(folder).digest() == fake.digest()
+
+
+def test_a_record_that_a_file_has_twice_is_used_once(tmp_path: Path) -> None:
+    folder, records = tmp_path / "out", made(1, 9)
+    records.insert(5, replace(records[2], source_row=3, arrived=7.0))
+    records.insert(7, replace(records[2], channels={"arm.q1": 9.0}))
+    fake = run(folder, Listed(records))
+    (ignored,) = [e for e in events(folder) if e.get("verdict") == "ignored"]
+    assert ignored["id"] == "p3" and "came before" in ignored["why"] and fake.count == 9
+    assert len(taken(folder)) == 10 and replayed(folder).digest() == fake.digest()
 
 
 def sent(number: int, **given: Any) -> dict[str, Any]:
