@@ -289,20 +289,26 @@ class Situation:
 
         ``earlier`` is the last decision where none matters now; ``since`` and ``last_good`` are each a record.
         """
-        causes = self._causes(level)
+        meant = [event for event in self._noted if _meant_level(event) == level]
+        decided = [event for event in meant if event["event"] == "decision"]
+        causes = [event for event in decided if event["sequence"] == decided[-1]["sequence"]]  # two may change at once
         cause = causes[-1] if causes else None
+        leading = [event for event in meant if event.get("do")]
+        newest = [event for event in leading if event["sequence"] == leading[-1]["sequence"]]
+        # A decision says it better than the change of level that it makes.
+        advice = dict.fromkeys(event["do"] for event in [e for e in newest if e["event"] == "decision"] or newest)
         good = good if self._first is None else self._first.get("last_good")
         back = self._over if self._over and self._over.get("kind") == "rollback" else None
         off = self._off_since(cause or back)
         screen: dict[str, Any] = {
-            "do": self._advice(level) or (back or {}).get("do") or _general_advice(level, good),
+            "do": " ".join(advice) or (back or {}).get("do") or _general_advice(level, good),
             "off_mm": float(f"{median(off):.4g}") if off else None,
             "off_of": len(off),
             "last_good": good,
             "rollback": good and f"armcal control {shlex.quote(str(folder))} rollback {good['sequence']}",
         }
         if cause is not None:
-            screen["what"] = " ".join(map(_what, causes))
+            screen["what"] = " ".join(f"{event['what']} {sure_to(event['sure_percent'])}." for event in causes)
             screen["confirm"] = " ".join(dict.fromkeys(event["confirm"] for event in causes if event.get("confirm")))
             screen["off_before_mm"] = cause.get("tip_error_mm")
         elif self._decision is not None:
@@ -314,17 +320,6 @@ class Situation:
             screen["since"] = {key: value for key, value in since.items() if value is not None}
         return screen
 
-    def _causes(self, level: str) -> list[Event]:
-        """The newest decisions that mean this level: two at once where two things changed."""
-        meant = [event for event in self._noted if event["event"] == "decision" and _meant_level(event) == level]
-        return [event for event in meant if event["sequence"] == meant[-1]["sequence"]]
-
-    def _advice(self, level: str) -> str | None:
-        leading = [event for event in self._noted if _meant_level(event) == level and event.get("do")]
-        newest = [event for event in leading if event["sequence"] == leading[-1]["sequence"]]
-        decided = [event for event in newest if event["event"] == "decision"]
-        return " ".join(dict.fromkeys(str(event["do"]) for event in decided or newest)) or None
-
     def _off_since(self, cause: Event | None) -> Sequence[float]:
         """The newest readings after a decision; where none came yet, the newest alone, but after a roll-back none."""
         place = -1 if cause is None else cause["sequence"]
@@ -333,22 +328,12 @@ class Situation:
         return after or ([] if none else [mm for _, mm in self._off][-1:])
 
 
-def _meant_level(event: Event) -> str | None:
-    if event["event"] == "level":
-        return str(event["to"])
-    if event.get("level") is not None:
-        return str(event["level"])
-    kind = KINDS.get(event.get("kind", ""))
-    return kind.level if kind else None
+def _meant_level(event: Event) -> Any:
+    return event["to"] if event["event"] == "level" else event.get("level")
 
 
 def _first_record(event: Event) -> int:
     return int(event.get("since", event.get("sequence")) or 0)
-
-
-def _what(decision: Event) -> str:
-    sure = f" {sure_to(decision['sure_percent'])}." if decision.get("sure_percent") is not None else ""
-    return f"{decision.get('what') or decision['sentence']}{sure}"
 
 
 def _general_advice(level: str, good: Event | None) -> str:
