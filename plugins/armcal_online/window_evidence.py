@@ -269,15 +269,11 @@ class RecordsSince:
     """Records since a change, about the belief before the first of them; each may be an outlier."""
 
     def __init__(
-        self,
-        records: Sequence[Recent],
-        observer: Observer,
-        process_noise: ProcessNoise,
-        outlier_covariances: Sequence[Array],
-        share: float,
-        freedom: float,
+        self, records: Sequence[Recent], observer: Observer, process_noise: ProcessNoise, outliers: OutlierSettings
     ) -> None:
-        self._freedom, self._n = freedom, len(process_noise.rates)
+        share, errors = outliers.fraction, [_outlier_covariance(observer, r, outliers) for r in records]
+        self._freedom = freedom = min(observer.freedom(r.readings) for r in records)
+        self._n = len(process_noise.rates)
         belief = before = records[0].before
         self._observations = [observer.observation(before, r.readings, r.joint_noise) for r in records]
         gaussian, count = before.gaussian, len(records)
@@ -299,7 +295,7 @@ class RecordsSince:
                 [
                     math.log(share)
                     + log_density_of_outlier(r.innovation, r.slope @ prior @ r.slope.T + r.noise, error, freedom)
-                    for r, prior, error in zip(self._unmoved, self._priors, outlier_covariances, strict=True)
+                    for r, prior, error in zip(self._unmoved, self._priors, errors, strict=True)
                 ]
             ),
         )
@@ -402,9 +398,7 @@ class HypothesisFilter:
         likeliest: dict[int, Explanation] = {}
         for onset in large[-_MOST_ONSETS : len(large) + 1 - least]:
             records = recent[onset:]
-            errors, known = [self._outlier_covariance(r) for r in records], min(map(self.freedom, records))
-            parts = (self._observer, self._process_noise, errors, self._outliers.fraction, known)
-            since = RecordsSince(records, *parts)
+            since = RecordsSince(records, self._observer, self._process_noise, self._outliers)
             none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood
             misfits = [i - onset for i in large if i >= onset]
             rejected = [i for i in misfits if records[i].rejected]
@@ -444,7 +438,7 @@ class HypothesisFilter:
         observation = self._observer.observation(belief, record.readings, record.joint_noise)
         try:
             first = observation.at(belief.gaussian.mean)
-            freedom, stated = self.freedom(record), self._outlier_covariance(record)
+            freedom, stated = self.freedom(record), _outlier_covariance(self._observer, record, self._outliers)
             outside = np.log(share) + log_density_of_outlier(first.innovation, first.noise, stated, freedom)
             update = self._estimator.update(belief.gaussian, observation)
         except ArmcalError:
@@ -457,8 +451,9 @@ class HypothesisFilter:
     def freedom(self, record: Recent) -> float:
         return self._observer.freedom(record.readings)
 
-    def _outlier_covariance(self, record: Recent) -> Array:
-        kernels = self._observer.problem.kernels
-        size = {"length": self._outliers.length, "angle": self._outliers.angle}
-        deviations = [size[d] for reading in record.readings for d in kernels[reading.factor].factor.dimensions]
-        return np.diag(np.array(deviations) ** 2)
+
+def _outlier_covariance(observer: Observer, record: Recent, outliers: OutlierSettings) -> Array:
+    """Of an error of the stated size."""
+    kernels, size = observer.problem.kernels, {"length": outliers.length, "angle": outliers.angle}
+    deviations = [size[d] for reading in record.readings for d in kernels[reading.factor].factor.dimensions]
+    return np.diag(np.array(deviations) ** 2)
