@@ -1,5 +1,6 @@
-"""An arm or designs of it as they are given, and areas cell by cell: whether the tool reaches them, turned how, held by
-the servos, and how far it sags there.
+"""``armcal capability``: an arm or designs of it, and areas cell by cell.
+
+Whether the tool reaches them, turned how, held by the servos, and how far it sags there.
 
 Each cell's centre is searched for from the nearest of many postures (``armcal.calibration.inverse``).
 """

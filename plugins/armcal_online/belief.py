@@ -9,11 +9,8 @@ standard deviation whose correlation falls by e over a distance (Ornstein-Uhlenb
 time, coordinates of the belief after those of the parameters. One that is a drift moves a parameter; one of a shared
 error, the part of the model's error that neighbouring records have in common, shifts what an instrument reads.
 
-Scaled coordinates about a value vector, and back: the space of a belief about parameters.
-
-Numbers between bounds and entries of semidefinite matrices are moved as they are, even out of their domain: the belief
-stays the Gaussian that the records make, and only what is taken from it is brought inside (see ``inside`` and
-``belief.most_likely``). Rotations, poses and screw axes are moved within their domain.
+Numbers between bounds and entries of semidefinite matrices are moved out of their domain too: only what is taken from a
+belief is brought inside (``inside``, ``most_likely``). Rotations, poses and screw axes are moved within their domain.
 """
 
 from __future__ import annotations

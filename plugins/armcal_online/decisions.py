@@ -1,6 +1,8 @@
 """The kinds of decisions: what each means, what an operator does about it, and what would confirm it.
 
 A new kind is one entry of ``KINDS`` and its section in docs/decisions.md, which says what happened, in general.
+And the first screen for an operator on call, which a recalibration keeps from its own events and writes into
+``status.json``. Whether that process still runs is not its own to say: ``present`` asks the control socket.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a calibration to what a recalibration starts with: problem, belief, noise of records and of the process."""
+"""What a recalibration starts with, what it knows between two records (as JSON to the last bit), and what it writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes of joints and tool, learned from what a model leaves.
+"""Gaussian processes of joints and tool, learned from what a model leaves. [Rasmussen2006]
 
 Of each turning joint's error over its own angle: a long one, and one of the likeliest finer length scale; the long one
 holds on a little where no record stood. Of the tool's shifts, and of its turns, over all joints and directions of

@@ -2,6 +2,7 @@
 
 Two nodes carry its heat, in units in which a steady loss of 1 heats the winding by 1 above the air:
 ``loss = (torque / continuous)^2``. The winding lies inside the case, which the air cools; heat 1 is its limit.
+And what an arm was made to do, judged by what reaches its servos.
 """
 
 import json

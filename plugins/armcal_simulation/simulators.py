@@ -1,6 +1,6 @@
-"""An arm with a stated truth: poses, command quantisation, noise and outliers from a fixed seed.
+"""Arms with a stated truth, from a fixed seed: measured in poses, and in contact with sockets, clamps or each other.
 
-The record has the given command; the arm stands at the nearest one that its servo board can make.
+The record of a pose has the given command; the arm stands at the nearest one that its servo board can make.
 """
 
 from collections.abc import Mapping

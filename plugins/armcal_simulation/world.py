@@ -1,4 +1,4 @@
-"""A simulated tracker: frames of noisy poses, which fail as a tracker's do."""
+"""A simulated bench: its truth, its arm on servos and its tracker, moved on from event to event."""
 
 import math
 from collections import deque
