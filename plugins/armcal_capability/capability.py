@@ -262,28 +262,21 @@ class MechanicsFunction:
                 start, values = self._channels.index(channel), np.atleast_1d(stated)
                 self._record[start : start + len(values)] = values
         self._equilibrium = Equilibrium(expression, choice)
-        tool = expression.base_T_tool
-        pose = ca.vertcat(ca.vec(tool.rotation), tool.translation)
-        outputs = [ca.densify(output) for output in (pose, expression.efforts)]
-        function = ca.Function("capability", [expression.record, expression.state], outputs, {"cse": True})
+        inputs, efforts = [expression.record, expression.state], [ca.densify(expression.efforts)]
+        function = ca.Function("capability", inputs, efforts, {"cse": True})
         sample = [
             self.records(np.linspace(-1, 1, _LANES) * np.ones((self._joints, 1))),
             np.zeros((expression.state.numel(), _LANES)),
         ]
-        self._function = BatchFunction(function, sample, choice)
+        self._efforts = BatchFunction(function, sample, choice)
 
     def __call__(self, commands: Array, states: Array | None = None) -> Mechanics:
         """``states`` are where the search for an equilibrium begins."""
-        record, count = self.records(commands), commands.shape[1]
+        record = self.records(commands)
         standing = self._equilibrium(record, states)
-        pose, efforts = self._function(record, standing.states)
-        return Mechanics(
-            positions=pose[9:],
-            rotations=pose[:9].reshape(3, 3, count).swapaxes(0, 1),
-            efforts=efforts,
-            states=standing.states,
-            settled=np.asarray(standing.settled, dtype=bool),
-        )
+        tools, settled = standing.base_T_tool, np.asarray(standing.settled, dtype=bool)
+        (efforts,) = self._efforts(record, standing.states)
+        return Mechanics(tools[:, :3, 3].T, tools[:, :3, :3].transpose(1, 2, 0), efforts, standing.states, settled)
 
     def tools(self, commands: Array) -> tuple[Array, Mask]:
         standing = self._equilibrium(self.records(commands))

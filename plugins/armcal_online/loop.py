@@ -189,10 +189,14 @@ class Outputs:
         self._stream.write(line)
         if lost and self._stream.lost == lost:
             self._stream.lost = 0
-            self._alarm(f"{lost} events were left out here: nobody read them in time.")
+            self._alarm(EVENTS, f"{lost} events were left out here: nobody read them in time.")
 
-    def _alarm(self, sentence: str) -> None:
-        self._stream.write(as_line({"event": "alarm", "at": time.time(), "sentence": sentence}))
+    def _alarm(self, name: str, sentence: str) -> None:
+        alarm = {"event": "alarm", "at": time.time(), "sentence": sentence}
+        if name == EVENTS:  # it is not written to the file that is in trouble itself
+            self._stream.write(as_line(alarm))
+        else:
+            self.event(alarm)
 
     def _attempt(self, name: str, write: Callable[[], None]) -> bool:
         try:
@@ -200,11 +204,11 @@ class Outputs:
         except OSError as fault:
             if name not in self._troubled:
                 self._troubled.add(name)
-                self._alarm(f"{name} cannot be written ({fault.strerror}); it is tried again.")
+                self._alarm(name, f"{name} cannot be written ({fault.strerror}); it is tried again.")
             return False
         if name in self._troubled:
             self._troubled.discard(name)
-            self._alarm(f"{name} is written again.")
+            self._alarm(name, f"{name} is written again.")
         return True
 
 
