@@ -27,7 +27,7 @@ from armcal_online.state import Health, State, improbability, many_outliers, nis
 from armcal_online.window_evidence import HypothesisFilter, Size, rate_of, size_of
 
 
-def change_decision(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:
+def _change_decision(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:
     best = alike[0]
     hypothesis, kind, subject = best.hypothesis, best.hypothesis.kind, best.hypothesis.subject
     since = state.recent[best.onset :]
@@ -55,7 +55,7 @@ def change_decision(state: State, alike: Sequence[Explanation], others: Sequence
     return Decision(kind, what, why, log_odds, onset, subject, names, size)
 
 
-def together_decisions(
+def _together_decisions(
     state: State,
     steps: Steps,
     alike: Sequence[Explanation],
@@ -83,7 +83,7 @@ def together_decisions(
     return tuple(decisions)
 
 
-def unfit_decision(state: State, steps: Steps, why: str, log_odds: float, since: int | None = None) -> Decision:
+def _unfit_decision(state: State, steps: Steps, why: str, log_odds: float, since: int | None = None) -> Decision:
     unfollowed = f"; steps of {', '.join(steps.unfollowed)} cannot be followed" if steps.unfollowed else ""
     first = _first_rejected(state) if since is None else since
     return Decision("model_no_longer_fits", "The model no longer fits the records", why + unfollowed, log_odds, first)
@@ -113,7 +113,7 @@ def _first_rejected(state: State) -> int:
     return next((record.sequence for record in state.recent if record.rejected), state.sequence)
 
 
-def first_of(state: State, count: int) -> int:
+def _first_of(state: State, count: int) -> int:
     return state.ids[-min(count, len(state.ids))].sequence if state.ids else state.sequence
 
 
@@ -240,7 +240,7 @@ class Judge:
         by_chance = many_outliers(rejected, gate.window, self._outliers(state))
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
-            return state, (unfit_decision(state, self._steps, text, log_odds_of(by_chance)),)
+            return state, (_unfit_decision(state, self._steps, text, log_odds_of(by_chance)),)
         if rejected < gate.rejected or by_chance >= settings.probability:
             return state, ()
         what = f"{rejected} of the last {len(state.recent)} records do not fit, and no change explains them yet"
@@ -331,15 +331,15 @@ class Judge:
         )
         sizes = [self._size(since[0].before, belief, change) for change in best.hypothesis.singles]
         if best.hypothesis.parts:
-            return after, together_decisions(state, self._steps, alike, others, sizes)
-        decision = change_decision(state, alike, others, sizes[0])
+            return after, _together_decisions(state, self._steps, alike, others, sizes)
+        decision = _change_decision(state, alike, others, sizes[0])
         if best.hypothesis.kind == "general_change":
             late = tuple(s for s in state.changes if state.sequence - s < 10 * self._settings.gate.window)
             after = replace(after, changes=(*late, state.sequence)[-_UNEXPLAINED:])
             if len(after.changes) >= _UNEXPLAINED:
                 text = f"{len(after.changes)} changes that nothing explains came within a short time"
                 first = after.changes[0]
-                return after, (unfit_decision(state, self._steps, text, decision.log_odds, first),)
+                return after, (_unfit_decision(state, self._steps, text, decision.log_odds, first),)
         return after, (decision,)
 
     def _name_suspect(self, state: State) -> tuple[State, tuple[Decision, ...]]:
@@ -388,8 +388,8 @@ class Judge:
         state = replace(state, nis=(), drifted=state.drifted + 1)
         if state.drifted >= _UNEXPLAINED:
             text = f"the NIS of {count} records is {ratio:.1f} times what chance makes it, again and again"
-            since = first_of(state, _UNEXPLAINED * count)
-            return state, (unfit_decision(state, self._steps, text, log_odds_of(by_chance), since),)
+            since = _first_of(state, _UNEXPLAINED * count)
+            return state, (_unfit_decision(state, self._steps, text, log_odds_of(by_chance), since),)
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
         belief = state.belief.widened(len(self._space.scales), factor)
         what = f"The last {count} records miss by more than stated, although no single one does by much"
@@ -398,7 +398,7 @@ class Judge:
             "faster than stated, or the instrument is worse; "
             f"all standard deviations are made {factor:.1f} times larger"
         )
-        decision = Decision("drift", what, why, log_odds_of(by_chance), first_of(state, count))
+        decision = Decision("drift", what, why, log_odds_of(by_chance), _first_of(state, count))
         return replace(state, belief=belief), (decision,)
 
     def _detect_slow(self, state: State) -> tuple[State, tuple[Decision, ...]]:

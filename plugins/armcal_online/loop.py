@@ -93,12 +93,9 @@ class StateReplayer:
                 sequence = entry.sequence
                 self.apply(sequence, entry.kind, entry.content)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as fault:
-            raise DataError(
-                f"entry {sequence} is whole, but none that this version writes ({type(fault).__name__}: {fault}).",
-                where=Location(str(self._journal.path)),
-                hint="Read it with the version of armcal that wrote it, or begin a new --out from its "
-                "calibration.yaml.",
-            ) from fault
+            why = f"entry {sequence} is whole, but none that this version writes ({type(fault).__name__}: {fault})."
+            hint = "Read it with the version of armcal that wrote it, or begin a new --out from its calibration.yaml."
+            raise DataError(why, where=Location(str(self._journal.path)), hint=hint) from fault
 
     def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
         if kind == RECORD:
@@ -227,8 +224,8 @@ class Recalibration:
         self._is_written = False
         self._since_calibration = 0
         self._calibrated = self._status_written = -float("inf")
-        self.sequence = journal.sequence
-        self.finishing = ""
+        self.sequence = journal.sequence  # of the last entry that changed anything
+        self.finishing = ""  # why it is about to end; empty while it is not
         self._fault: Exception | None = None  # of a record that a program sent
         busy = ("a recalibration is running here.", "Give another --out.")
         self.control = JsonServer.at(outputs.folder / SOCKET, *busy, self.answer)
