@@ -8,7 +8,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.config.yaml_source import load_config
 from armcal.plugins import discover
-from armcal_capability.survey import LoadSettings, Mechanics, MechanicsFunction, load_task, quantities, spread
+from armcal_capability.capability import LoadSettings, Mechanics, MechanicsFunction, load_task, quantities, spread
 
 from benchmarks import lrm, lrm_numpy
 from benchmarks.report import Row

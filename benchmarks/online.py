@@ -18,8 +18,7 @@ from armcal.problem.kernel import NEAR_REST_RAD
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
-from armcal_online.tracking.belief import Belief, GaussMarkovStates, StateSpace
-from armcal_online.tracking.observer import Observer, Reading
+from armcal_online.belief import Belief, GaussMarkovStates, Observer, Reading, StateSpace
 from filterpy.kalman import ExtendedKalmanFilter
 
 from benchmarks import lrm

@@ -12,13 +12,14 @@ from pathlib import Path
 from armcal.errors import DataError
 from armcal.io.lines import StandardOutput
 from armcal.measure.reader import ReadRequest, RequestedChannel
-from armcal_online.running.loop import Pace
-from armcal_online.running.session import Setup, opened
+from armcal_online import loop
+from armcal_online.commands import header_of, opened
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Lines, RowParser, open_source
-from armcal_online.tracking.settings import RecalibrateSettings
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
 CALIBRATION = "armcal_calibration: 0\n"
+loop.CALIBRATION_GAP_S, loop.STATUS_S, loop.CHECKPOINT_RECORDS = 0.0, 0.05, 25
 
 
 def request():
@@ -91,14 +92,14 @@ class FakeRecalibrator:
         return {"event": "started", "level": "nominal"}
 
 
-def setup(folder, pace=None, stream=None, **given):
-    """A setup whose calibration lies beside the folder."""
+def begun(folder, fake, source, stream=None):
+    """A recalibration from a calibration that lies beside the folder."""
     calibration = Path(folder).with_suffix(".start.yaml")
     if not calibration.exists():
         calibration.parent.mkdir(parents=True, exist_ok=True)
         calibration.write_text(CALIBRATION)
-    pace = pace or Pace(calibration_gap_s=0.0, status_s=0.05, checkpoint_records=25)
-    return Setup(Path(folder), calibration, StandardOutput(stream), pace, **given)
+    header = header_of(Path(folder), calibration, fake)
+    return opened(Path(folder), header, fake, source, StandardOutput(stream))
 
 
 def main(folder, source, at_end):
@@ -111,7 +112,7 @@ def main(folder, source, at_end):
         records = Lines(rows, tail.stdout.fileno())
     else:
         records = open_source(source, rows)
-    with opened(setup(folder, stream=sys.stdout.buffer), fake, records) as going:
+    with begun(folder, fake, records, sys.stdout.buffer) as going:
         going.run()
 
 

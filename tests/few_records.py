@@ -19,9 +19,9 @@ from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.result import reserved, write
+from armcal_online.recalibrator import Recalibrator
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import RecalibrateSettings
 from scipy.spatial.transform import Rotation
 
 ARM = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from armcal_online.mission.simulator import ArmEventSettings, Event, PayloadSettings
-from armcal_online.tracking.hypotheses import GRAVITY, LINK, PAYLOAD
+from armcal_online.hypotheses import GRAVITY, LINK, PAYLOAD
+from armcal_online.mission_simulator import ArmEventSettings, Event, PayloadSettings
 
 Decision = Mapping[str, Any]
 """As ``mission.json`` has it: its ``day`` and ``kind``, perhaps a ``joint``, a ``link`` or several ``candidates``."""

@@ -12,8 +12,8 @@ from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_prog
 from armcal.estimate.polish import descended, polish
 from armcal.estimate.robust import reweighted
 from armcal.problem.problem import PosedProblem, Problem
-from armcal_online.mission.mission import MissionPlan, Series
-from armcal_online.mission.simulator import Mission
+from armcal_online.mission import MissionPlan, Series
+from armcal_online.mission_simulator import Mission
 
 _GROWTH, _FIRST_STEPS, _DAMPING, _ENOUGH = 1.1, 5, 1e-3, 1e-3
 _DOUBTFUL = 2.0  # residuals so many times the noise: the fit may have come to rest at the wrong minimum

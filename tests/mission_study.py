@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 from armcal.base.arrays import Array
 from armcal.calibration.calibration import Calibration
-from armcal_online.mission.mission import ErrorCurve, MissionLog, MissionPlan, before_launch, error_curve, run_mission
-from armcal_online.mission.simulator import DAY_S, with_payload
+from armcal_online.mission import ErrorCurve, MissionLog, MissionPlan, before_launch, error_curve, run_mission
+from armcal_online.mission_simulator import DAY_S, with_payload
 
 from tests.mission_decisions import Decision, Occurrence, occurrences, verdicts
 from tests.mission_refits import refits

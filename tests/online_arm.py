@@ -21,12 +21,11 @@ from armcal.config.yaml_source import load_config
 from armcal.estimate.online import OnlineEstimator, Update
 from armcal.plugins import discover
 from armcal.problem.problem import Problem
+from armcal_online.belief import Belief, RecordObservation
+from armcal_online.recalibrator import Recalibrator
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming
-from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.observer import RecordObservation
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.start import FilterSetup, filter_setup
+from armcal_online.state import FilterSetup, filter_setup
 from made_calibrations import made_record
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "lrm_arm" / "arm.yaml"

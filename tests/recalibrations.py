@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 from armcal.io.journal import JOURNAL, Entry, KeptJournal
-from armcal_online.running.loop import Recalibration, StateReplayer
-from armcal_online.running.session import opened
+from armcal_online.loop import Recalibration, StateReplayer
 from armcal_online.sources import Incoming
-from fake_recalibrator import HEADER, FakeRecalibrator, row, setup
+from fake_recalibrator import HEADER, FakeRecalibrator, begun, row
 
 
 class PowerCutError(Exception):
@@ -56,7 +55,7 @@ def table(count: int) -> str:
 def run(folder: Path, source: Any, settings: Any = None, **given: Any) -> FakeRecalibrator:
     """To its end, in this process."""
     fake = FakeRecalibrator(settings=settings)
-    with opened(setup(folder, **given), fake, source) as going:
+    with begun(folder, fake, source, **given) as going:
         going.run()
     return fake
 
@@ -74,10 +73,10 @@ def replayed(folder: Path) -> FakeRecalibrator:
     """What the journal makes of it from its first entry on, each checkpoint compared."""
     fake = FakeRecalibrator()
     with KeptJournal(folder) as journal:
-        replayer = StateReplayer(fake, journal.until)
+        replayer = StateReplayer(fake, journal)
         first, _ = journal.until(1)
         assert first.sequence == 0
-        replayer.restore(first.content, 0)
+        replayer.replay(first, ())
         for entry in journal.entries():
             replayer.apply(entry.sequence, entry.kind, entry.content)
             if (checkpoint := journal.until(entry.sequence)[0]).sequence == entry.sequence:
@@ -96,7 +95,7 @@ def kinds(folder: Path) -> list[str]:
 @contextmanager
 def stepping(folder: Path, source: Any) -> Iterator[tuple[Recalibration, FakeRecalibrator]]:
     fake = FakeRecalibrator()
-    with opened(setup(folder), fake, source) as going:
+    with begun(folder, fake, source) as going:
         yield going, fake
 
 

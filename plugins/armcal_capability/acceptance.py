@@ -43,7 +43,7 @@ from armcal.run.experiment import Experiment, with_data
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from armcal_capability.survey import examined_arm
+from armcal_capability.capability import examined_arm
 
 OURS = ("acceptance.json", "acceptance.csv")
 ISO_CYCLES = 30  # visits to a pose that the standard asks for
@@ -89,8 +89,6 @@ _HEADINGS = ("section", "of", "with", "cycles", "model", "figure", "value", "low
 
 @dataclass(frozen=True)
 class ArmToJudge:
-    """One arm as described, and as calibrated."""
-
     system: System  # with the arm, and the one measurement that is judged
     models: Mapping[str, Parameters]  # nominal and, from a calibration, calibrated
     source: ConfigSource  # with the section data, which says how records are read
@@ -128,8 +126,6 @@ class ArmToJudge:
 
 @dataclass(frozen=True)
 class Visits:
-    """Records of poses that were visited again and again."""
-
     dataset: Dataset
     cycles: Array  # number of each record's cycle (N)
     groups: Mapping[tuple[str, str], Indices]  # of a pose from a direction, places of its records
@@ -196,8 +192,6 @@ def acceptance(console: Console, source: Path, records: Path, out: Path, frame: 
 def _content(
     rows: Sequence[Row], visits: Visits, comparisons: Mapping[str, Comparison], noise: float, warnings: Sequence[str]
 ) -> dict[str, Any]:
-    """What the figures come to, in mm and deg; ``noise`` is the RP (mm) that the declared noise makes alone."""
-
     def ends(model: str, name: str) -> dict[str, float] | None:
         values = np.abs([row.value for row in rows if (row.model, row.name) == (model, name)])
         return {"mean": float(np.mean(values)), "most": float(np.max(values))} if len(values) else None
@@ -217,7 +211,6 @@ def _content(
 
 
 def _sentences(content: Mapping[str, Any], name: str) -> list[str]:
-    """The result in sentences, what it rests on, and what is to be known of it."""
     rp, ends = content["repeatability_mm"], "{mean:.3g} mm ({most:.3g} mm at the worst pose)"
     accuracy = "; ".join(f"{model} {ends.format(**own['AP_mm'])}" for model, own in content["summary"].items())
     texts = [f"{name}: mean pose accuracy AP {accuracy}; mean repeatability RP {ends.format(**rp)}."]
@@ -238,8 +231,6 @@ def _sentences(content: Mapping[str, Any], name: str) -> list[str]:
 
 
 def _tables(rows: Sequence[Row]) -> Iterator[Table]:
-    """A table a section, with its caption and headings: a row a pose or pair, a column a figure."""
-
     def shown(row: Row) -> str:
         decimals = min(decimals_for(max(row.value - row.low, abs(row.value) / 100)), 4)
         high = f"{row.high:.{decimals}f}" if row.high < 1e4 else "?"
@@ -262,11 +253,6 @@ def _tables(rows: Sequence[Row]) -> Iterator[Table]:
 
 
 def read_visits(subject: ArmToJudge, registry: PluginRegistry, path: Path) -> Visits:
-    """The records of a table as visits; poses are named by a column, or found by their joint channels.
-
-    Raises:
-        DataError: the table is refused, a cycle occurs twice, or no pose has two visits.
-    """
     source, arms = subject.source, subject.system.arms
     cycle = RequestedChannel(CYCLE, (CYCLE,), DIMENSIONLESS, required=False)
     channels = (*requested_channels(arms, subject.system.measurements, measured=True), cycle)
@@ -331,12 +317,6 @@ def refuse_strangers(visits: Visits, measured: Array, reach: float) -> None:
 
 
 def compare(subject: ArmToJudge, model: str, visits: Visits, frame: _Frame) -> Comparison:
-    """The comparison by one model of the arm.
-
-    Raises:
-        DataError: positions of the records cannot be compared, or no frame can be found.
-        NotConvergedError: a record has no equilibrium.
-    """
     system, parameters, dataset = subject.system, subject.models[model], visits.dataset
     problem = Problem.build(
         system.arms, system.measurements, parameters, system.environment, dataset, "interpreted", groups={}
@@ -373,7 +353,6 @@ def compare(subject: ArmToJudge, model: str, visits: Visits, frame: _Frame) -> C
 
 
 def _aligned(tools: Tools, sighting: Sighting, where: Location) -> Comparison:
-    """With the base, and the target on the tool, where the records have them."""
     poses = np.unique(np.round(tools.places, 4), axis=1).shape[1]
     ranked = alignments(tools, sighting.measured, np.eye(3), sighting.turned)
     if not ranked or poses < 3:
@@ -423,7 +402,6 @@ def _refuse(dataset: Dataset, index: int, field: str, message: str, hint: str) -
 
 
 def assess(visits: Visits, comparisons: Mapping[str, Comparison]) -> Iterator[Row]:
-    """All figures: of each pose AP and RP, of pairs of poses AD and RD, of poses by several directions vAP."""
     first, of_pose = next(iter(comparisons.values())), dict[str, dict[str, Indices]]()
     attained, turned = _MM * first.attained, first.turns
     for (pose, direction), own in visits.groups.items():
@@ -509,7 +487,6 @@ def mean_figure(values: Array) -> Figure:
 
 
 def spread_figure(values: Array) -> Figure:
-    """Three standard deviations."""
     size, freedom = _TIMES * float(np.std(values, ddof=1)), len(values) - 1
     low, high = (np.sqrt(freedom / chi2.ppf(share, freedom)) for share in (_HIGH, _LOW))
     return Figure(size, size * float(low), size * float(high))

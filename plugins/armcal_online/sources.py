@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 from zlib import crc32
@@ -50,27 +51,11 @@ _MARK = b"\xef\xbb\xbf"  # of byte order
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a record came from: the file in its source, the row in that, and when (unix seconds, our clock)."""
-
-    source_key: str = ""
-    row: int = 0
-    arrived: float = field(default_factory=lambda: time.time())
-
-
-@dataclass(frozen=True)
 class Incoming:
-    """One record as it came.
-
-    Attributes:
-        channels: SI numbers by channel (``arm.q1``, ``tracker.x``, ``gravity_z``, ``time``); NaN where a value is
-            missing, infinite as given.
-    """
-
-    record_id: str  # its id; the row where its source gives none
-    channels: Mapping[str, float]
-    labels: Mapping[str, str]  # text columns that no channel claims (a socket's name)
-    arrived: float  # unix seconds, by our clock
+    record_id: str = ""  # its id; the row where its source gives none
+    channels: Mapping[str, float] = field(default_factory=dict)  # SI numbers, NaN where missing (``arm.q1``, ``time``)
+    labels: Mapping[str, str] = field(default_factory=dict)  # text columns that no channel claims (a socket's name)
+    arrived: float = field(default_factory=lambda: time.time())  # unix seconds, by our clock
     source_key: str = ""  # the file within the source, or empty
     source_row: int = 0  # the row in it, from 1 (the line in a text file)
     fault: str = ""  # why it could not be read, a sentence; there are no channels then
@@ -89,11 +74,6 @@ class Incoming:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Incoming:
-        """The record that ``as_dict`` wrote.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is no such record.
-        """
         return cls(
             record_id=str(content["id"]),
             channels={name: float(value) for name, value in content["channels"].items()},
@@ -106,15 +86,9 @@ class Incoming:
 
 
 class Source(Protocol):
-    """Records, one at a time.
-
-    Attributes:
-        keeps_records: whether what is not taken stays in it (a file), or is lost (a stream).
-    """
-
     @property
     def keeps_records(self) -> bool:
-        """See above."""
+        """Whether what is not taken stays in it (a file), or is lost (a stream)."""
 
     @property
     def ended(self) -> bool:
@@ -128,7 +102,6 @@ class Source(Protocol):
         return
 
     def close(self) -> None:
-        """Let go of files and sockets, if there are any."""
         return
 
 
@@ -139,59 +112,38 @@ class RowParser:
         self._wanted = request.channels
         self._optional = tuple(replace(channel, required=False) for channel in request.channels)
         self._columns = dict(columns)
-        self._plans: dict[tuple[str, ...], Plan | str] = {}
+        self._plan = lru_cache(_PLANS)(self._plan_of)
 
     def table(self, line: str, source: str, number: int) -> tuple[LineTable, Plan]:
-        """The header of a CSV table, and which column is what.
-
-        Raises:
-            DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
-        """
         lines = LineTable.begun(line, source, number)
         header = renamed(header_of(lines.header, source, number), self._columns)
         return lines, self._matched(header)
 
-    def row(self, table: LineTable, plan: Plan, line: str, place: Place) -> Incoming:
-        """The record in a line of a table.
+    def row(self, table: LineTable, plan: Plan, line: str, blank: Incoming) -> Incoming:
+        return self._record(plan, table.row(line, blank.source_row), blank)
 
-        Raises:
-            DataError: it is no row of the table.
-        """
-        return self._record(plan, table.row(line, place.row), place)
-
-    def json_text(self, text: str, place: Place) -> Incoming:
+    def json_text(self, text: str, blank: Incoming) -> Incoming:
         try:
-            fields = json.loads(text, object_pairs_hook=_without_repeats)
+            fields = json.loads(text)
         except (ValueError, RecursionError) as fault:
-            return faulty(place, f"It is not JSON ({_short(str(fault), 120)}).")
-        return self.object(fields, place)
+            return faulty(blank, f"It is not JSON ({_short(str(fault), 120)}).")
+        return self.object(fields, blank)
 
-    def object(self, fields: Any, place: Place) -> Incoming:
-        """The record in a JSON object, name to number or text."""
+    def object(self, fields: Any, blank: Incoming) -> Incoming:
         if not isinstance(fields, dict):
             text = "an array" if isinstance(fields, list) else _short(json.dumps(fields), 40)
-            return faulty(place, f"Found {text}, expected a JSON object.")
-        names = tuple(fields)
-        if names not in self._plans:
-            if len(self._plans) >= _PLANS:
-                self._plans.clear()
-            own = {name: column for name, column in self._columns.items() if column in names}
-            try:
-                header = renamed(header_of(names, "", None) if names else Header("", None, ()), own)
-                self._plans[names] = self._matched(header)
-            except DataError as fault:
-                self._plans[names] = str(fault)
-        plan = self._plans[names]
-        if isinstance(plan, str):
-            return faulty(place, plan)
-        return self._record(plan, list(fields.values()), place)
+            return faulty(blank, f"Found {text}, expected a JSON object.")
+        plan = self._plan(tuple(fields))
+        return faulty(blank, plan) if isinstance(plan, str) else self._record(plan, list(fields.values()), blank)
+
+    def _plan_of(self, names: tuple[str, ...]) -> Plan | str:
+        own = {name: column for name, column in self._columns.items() if column in names}
+        try:
+            return self._matched(renamed(header_of(names, "", None) if names else Header("", None, ()), own))
+        except DataError as fault:
+            return str(fault)
 
     def _matched(self, header: Header) -> Plan:
-        """Which column is what.
-
-        Raises:
-            DataError: a column is ambiguous, has no unit, or one that every record needs is not there.
-        """
         plan = match_columns(header, self._optional)
         lacking = self._lacking(set(plan.channels))
         if lacking is not None:
@@ -212,16 +164,16 @@ class RowParser:
         nearest = min(by_part.values(), key=len, default=[])
         return nearest[0] if nearest else None
 
-    def _record(self, plan: Plan, cells: Sequence[Any], place: Place) -> Incoming:
+    def _record(self, plan: Plan, cells: Sequence[Any], blank: Incoming) -> Incoming:
         labels = {
             _clean(column.known_as[:MAX_LABEL]): text
             for column in plan.extra[:MAX_LABELS]
             if (text := _text(cells[column.index])) and len(text) <= MAX_LABEL
         }
-        text = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(place.row)
+        text = _text(cells[plan.record_id.index]).strip() if plan.record_id else str(blank.source_row)
         record_id = _short(text, MAX_ID)
         if not record_id:
-            return faulty(place, "Its id is empty.")
+            return faulty(blank, "Its id is empty.")
         channels: dict[str, float] = {}
         for channel, (column, unit) in plan.channels.items():
             try:
@@ -230,23 +182,17 @@ class RowParser:
                     refuse("", f"found the approach {number:g}, expected -1, 0 or 1.", "", column=column.name)
             except DataError as fault:
                 sentence = f"{_short(column.name, MAX_ID)}: {fault.message} {fault.hint}".rstrip()
-                return replace(faulty(place, sentence), record_id=record_id)
+                return replace(faulty(blank, sentence), record_id=record_id)
             channels[channel] = from_unit(number, unit)
-        return Incoming(record_id, channels, labels, place.arrived, place.source_key, place.row)
+        return replace(blank, record_id=record_id, channels=channels, labels=labels)
 
 
-def faulty(place: Place, sentence: str) -> Incoming:
-    return Incoming(
-        str(place.row), {}, {}, place.arrived, place.source_key, place.row, _short(_clean(sentence), MAX_FAULT)
-    )
+def faulty(blank: Incoming, sentence: str) -> Incoming:
+    return replace(blank, record_id=str(blank.source_row), fault=_short(_clean(sentence), MAX_FAULT))
 
 
 def _number(value: Any, name: str) -> float:
-    """A cell, or a value of a JSON object, in the column of a name; NaN where it is missing.
-
-    Raises:
-        DataError: it is no number.
-    """
+    """A cell, or a value of a JSON object, in the column of a name; NaN where it is missing."""
     if value is None:
         return math.nan
     if isinstance(value, str):
@@ -274,25 +220,12 @@ def _short(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if len(fields) != len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"{_short(twice, 40)} is given twice")
-    return fields
-
-
 class Lines(Source):
     """Lines of CSV or JSON: those of a file, or of a descriptor that stays the caller's (a pipe).
 
     A text is known again by its first record, and is read on after the last row that was taken of it, be it a file or
     what ``tail -n +1 -F`` gives of one. The header once more begins another text, as where a log was rotated. A last
     line without an end is a record in a file; in a pipe it may have been cut short.
-
-    Raises:
-        InputError: there is no such file.
-        DataError: it is empty, or its header cannot be used.
     """
 
     keeps_records, ended = True, False
@@ -322,8 +255,7 @@ class Lines(Source):
 
     @override
     def resume(self, positions: Mapping[str, int]) -> None:
-        # Keys of earlier versions begin with the name of the file.
-        self._positions = {key.rpartition("#")[2]: row for key, row in positions.items()}
+        self._positions = dict(positions)
 
     @override
     def incoming(self, wait_s: float) -> Incoming | None:
@@ -341,7 +273,7 @@ class Lines(Source):
                 data = os.read(self._descriptor, _CHUNK)
             except OSError as fault:
                 self.ended = True
-                return faulty(Place(self._key, self._row), f"The source cannot be read on ({fault.strerror}).")
+                return faulty(self._blank(self._row), f"The source cannot be read on ({fault.strerror}).")
             self._is_at_end = not data
             self._lines.extend(self._cutter.feed(data))
         return None
@@ -352,12 +284,15 @@ class Lines(Source):
         if self._file is not None:
             self._file.close()
 
+    def _blank(self, row: int) -> Incoming:
+        return Incoming(source_key=self._key, source_row=row)
+
     def _last(self) -> Incoming | None:
         if not self._cutter.begun:
             return None
         if self.keeps_records:
             return self._record(self._cutter.rest())
-        return faulty(Place(self._key, self._row + 1), "The last line has no end: it may have been cut short.")
+        return faulty(self._blank(self._row + 1), "The last line has no end: it may have been cut short.")
 
     def _record(self, line: bytes | None) -> Incoming | None:
         """The record in a line (None: one that was too long); None where it holds none, or was taken before."""
@@ -374,21 +309,21 @@ class Lines(Source):
             self._through = self._positions.get(self._key, 0)
         if self._row <= self._through:
             return None
-        place = Place(self._key, self._row)
+        blank = self._blank(self._row)
         if line is None:
-            return faulty(place, "The line has more than 1 MiB, expected a record.")
+            return faulty(blank, "The line has more than 1 MiB, expected a record.")
         try:
             text = text_of(line, self._name, SAVE_AS_TEXT, self._row)
             if bare.startswith(b"{"):
-                return self._rows.json_text(text, place)
+                return self._rows.json_text(text, blank)
             if self._table is not None:
-                return self._rows.row(*self._table, text, place)
+                return self._rows.row(*self._table, text, blank)
         except DataError as fault:
-            return faulty(place, f"{fault.message[:1].upper()}{fault.message[1:]} {fault.hint}")
+            return faulty(blank, f"{fault.message[:1].upper()}{fault.message[1:]} {fault.hint}")
         try:
             self._table, self._header = self._rows.table(text, self._name, self._row), bare
         except DataError as fault:
-            return faulty(place, str(fault))
+            return faulty(blank, str(fault))
         return None
 
 
@@ -406,16 +341,10 @@ class Sent(Source):
 
     def received(self, fields: Mapping[str, Any]) -> Incoming:
         self._row += 1
-        return self._rows.object(dict(fields), Place("", self._row))
+        return self._rows.object(dict(fields), Incoming(source_row=self._row))
 
 
 def open_source(text: str, rows: RowParser) -> Source:
-    """A source by its name: ``socket``, ``-``, or a CSV file.
-
-    Raises:
-        InputError: it is none of these, or cannot be opened.
-        DataError: the header of a file cannot be used.
-    """
     if text == "socket":
         return Sent(rows)
     if text == "-":

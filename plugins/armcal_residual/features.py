@@ -119,7 +119,6 @@ def roots_of(correlations: Array) -> Array:
 
 
 def share_between(features: Array) -> float:
-    """Mean share of a process's variance that independent features (N x M) leave."""
     return float(np.clip(1 - np.mean(np.sum(features**2, axis=1)), 0.0, 1.0))
 
 
@@ -196,11 +195,7 @@ def _posterior(products: Products, precisions: Array, noise: float, sizes: Seque
 
 
 def inverted(matrix: Array) -> tuple[Array, float]:
-    """The inverse of a positive definite matrix (n x n), and the logarithm of its determinant.
-
-    Raises:
-        LinAlgError: it is not.
-    """
+    """The inverse of a positive definite matrix (n x n), and the logarithm of its determinant."""
     lower, failed = dpotrf(matrix, lower=1, clean=1)
     if failed:
         raise LinAlgError("a covariance is not positive definite")
@@ -220,11 +215,7 @@ def packed(array: Array) -> str:
 
 
 def unpacked(text: str, rows: int | None, columns: int | None) -> Array:
-    """The array that settings hold, of so many rows, or columns.
-
-    Raises:
-        ValueError: it is damaged.
-    """
+    """The array that settings hold, of so many rows, or columns."""
     try:
         numbers = np.frombuffer(b"" if text == "none" else base64.b64decode(text, validate=True), dtype="<f8")
         array = numbers.reshape(

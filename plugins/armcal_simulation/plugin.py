@@ -7,10 +7,10 @@ _HERE = "armcal_simulation"
 
 @hookimpl
 def armcal_register_simulators(register: Register) -> None:
-    register("elastic_arm", f"{_HERE}.simulator:ElasticArmSimulator", "an arm with a stated truth")
-    register("contacts", f"{_HERE}.contacts:ContactsSimulator", "postures in sockets and clamps")
+    register("elastic_arm", f"{_HERE}.simulators:ElasticArmSimulator", "an arm with a stated truth")
+    register("contacts", f"{_HERE}.simulators:ContactsSimulator", "postures in sockets and clamps")
 
 
 @hookimpl
 def armcal_register_benches(register: Register) -> None:
-    register("servo_bench", f"{_HERE}.bench.servo_bench:ServoBench", "a board, an arm of servos and a tracker")
+    register("servo_bench", f"{_HERE}.servo_bench:ServoBench", "a board, an arm of servos and a tracker")

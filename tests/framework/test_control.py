@@ -15,8 +15,9 @@ import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
 from armcal.io.json_server import MOST_CLIENTS, JsonServer
-from armcal_online.running.session import answer, ask, control_server
-from armcal_online.running.situation import SOCKET
+from armcal_online.commands import ask
+from armcal_online.decisions import SOCKET
+from armcal_online.loop import Recalibration
 from click.testing import CliRunner
 
 
@@ -24,6 +25,10 @@ def echo(content: Mapping[str, Any]) -> Mapping[str, Any]:
     if content["command"] == "rollback":
         raise InputError("the journal does not reach there.", hint="Give a later one.")
     return {"ok": True, "asked": dict(content)}
+
+
+def control_server(folder: Path, answer: Callable[[Any], Mapping[str, Any]] = echo) -> JsonServer:
+    return JsonServer.at(folder / SOCKET, "a recalibration is running here.", "Give another --out.", answer)
 
 
 @contextmanager
@@ -79,7 +84,7 @@ def test_what_is_not_understood_gets_an_error(tmp_path: Path, data: bytes) -> No
 @pytest.mark.parametrize("command", ["reboot", ["pause"], None])
 def test_a_command_that_is_none_is_refused(command: Any) -> None:
     with pytest.raises(InputError, match="expected one of status, pause"):
-        answer(None, {"command": command})  # type: ignore[arg-type]
+        Recalibration.answer(None, {"command": command})  # type: ignore[arg-type]
 
 
 def test_several_requests_in_one_go_and_one_in_pieces(tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from armcal.estimate.online import Gaussian
-from armcal_online.sources import Incoming
-from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.decisions import (
+from armcal_online.belief import Belief
+from armcal_online.decisions import (
     KINDS,
     LEVEL_ADVICE,
     LEVELS,
@@ -25,15 +24,15 @@ from armcal_online.tracking.decisions import (
     spoken_time,
     sure,
 )
-from armcal_online.tracking.events import decided, last_good, record_name
-from armcal_online.tracking.hypotheses import Kind
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.state import REMEMBERED, Arrival, Health, State, remembering, troubled
+from armcal_online.hypotheses import Kind
+from armcal_online.recalibrator import Recalibrator, decided, last_good, record_name
+from armcal_online.sources import Incoming
+from armcal_online.state import REMEMBERED, Arrival, Health, State, remembering, troubled
 from online_arm import World, begun, predicted, random_poses, settings, told
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "decisions.md"
-SOURCES = ROOT / "plugins" / "armcal_online" / "tracking"
+SOURCES = ROOT / "plugins" / "armcal_online"
 NAMES = ("subject", "candidates", "calm", "good")
 SLIP = math.radians(6.0)
 
@@ -100,7 +99,7 @@ def test_per_cent_grows_with_log_odds_and_is_never_certain() -> None:
 def test_a_time_is_a_date_only_where_it_can_be_one() -> None:
     assert spoken_time(1041.5) == "at 1041.5 s"
     assert spoken_time(1.93e9) == "2031-02-27 23:06:40 UTC"
-    assert record_name(7, Arrival("r3", "", 7, 12.0)) == "record r3 (at 12 s, entry 7)"
+    assert record_name(7, Arrival("r3", 7, 12.0)) == "record r3 (at 12 s, entry 7)"
     assert record_name(7, None) == "entry 7"
 
 
@@ -109,7 +108,7 @@ def test_a_time_is_a_date_only_where_it_can_be_one() -> None:
 
 def test_no_record_is_good_from_the_first_that_a_decision_affects() -> None:
     belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
-    arrivals = tuple(Arrival(f"p{n}", "", n, float(n), is_good=n < 9) for n in range(1, 10))
+    arrivals = tuple(Arrival(f"p{n}", n, float(n), is_good=n < 9) for n in range(1, 10))
     state = State(belief, ids=arrivals, sequence=9)
     found = Decision("unexplained", "Some records do not fit", "chance", 9.0, since=6)
     after = troubled(state, [found], is_good=False)
@@ -132,11 +131,11 @@ def test_the_last_good_record_is_known_however_long_ago_it_was() -> None:
     belief = Belief(np.zeros(1), Gaussian(np.zeros(1), np.eye(1)))
     state = State(belief)
     for n in range(1, 3 * REMEMBERED):
-        state = remembering(state, Arrival(f"p{n}", "", n, float(n), is_good=n <= 5))
-    assert len(state.ids) == REMEMBERED and state.good == Arrival("p5", "", 5, 5.0, True)
+        state = remembering(state, Arrival(f"p{n}", n, float(n), is_good=n <= 5))
+    assert len(state.ids) == REMEMBERED and state.good == Arrival("p5", 5, 5.0, True)
     assert state.good_before(10_000) == state.good and state.good_before(5) is None
     assert State.from_dict(state.as_dict()).good == state.good
-    state = remembering(state, Arrival("new", "", 10_000, 1.0, is_good=True))
+    state = remembering(state, Arrival("new", 10_000, 1.0, is_good=True))
     assert state.good_before(10_000) == state.good
     newest = state.good_before(10_001)
     assert newest is not None and newest.record_id == "new"

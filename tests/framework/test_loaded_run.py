@@ -21,7 +21,7 @@ from armcal_bench.acquisition.preparation import (
     prepare,
 )
 from armcal_bench.acquisition.settings import ServoHeatSettings
-from armcal_simulation.bench.servo_model import ServoHeat, ServoJointSettings
+from armcal_simulation.servos import ServoHeat, ServoJointSettings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
 TRUTH = ServoJointSettings.si(continuous=0.3, winding_time=60.0, case_time=900.0, winding_share=0.3)

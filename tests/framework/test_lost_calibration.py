@@ -8,7 +8,7 @@ import pytest
 from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
-from armcal_online.tracking.start import calibration_text
+from armcal_online.state import calibration_text
 from armcal_serve.loading import Loader
 from click.testing import CliRunner, Result
 from online_arm import CONFIG, begun, calibration, settings

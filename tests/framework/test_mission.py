@@ -19,7 +19,7 @@ from armcal.calibration.calibration import Calibration
 from armcal.cli.main import cli
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
-from armcal_online.mission.mission import (
+from armcal_online.mission import (
     ErrorCurve,
     MissionLog,
     MissionPlan,
@@ -30,7 +30,7 @@ from armcal_online.mission.mission import (
     mission_figure,
     random_poses,
 )
-from armcal_online.mission.simulator import DAY_S, Mission, with_payload
+from armcal_online.mission_simulator import DAY_S, Mission, with_payload
 from click.testing import CliRunner, Result
 
 from tests.mission_decisions import occurrences, verdicts
@@ -171,7 +171,7 @@ def test_events_have_the_first_decision_after_them_and_records_are_counted(
 
 def test_recovery_is_counted_in_records_that_arrived(start: Parameters, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who is ``lag`` records late has the new offset at the record after so many; warmth moves on meanwhile."""
-    monkeypatch.setattr("armcal_online.mission.mission._RECOVERED", 5.0)
+    monkeypatch.setattr("armcal_online.mission._RECOVERED", 5.0)
     log = knowing_log(lag := 6)
     slip, swap, bump = figures(plan(), mission(), log, error_curve(plan(), start, mission(), log, {}))["events"]
     for event in (slip, swap):
@@ -335,8 +335,8 @@ def test_a_missing_or_broken_library_is_told_before_the_mission(
         assert name == "matplotlib"
         raise fault
 
-    monkeypatch.setattr("armcal_online.mission.mission.import_module", failing)
-    monkeypatch.setattr("armcal_online.mission.mission.run_mission", lambda *_: pytest.fail("it began first"))
+    monkeypatch.setattr("armcal_online.mission.import_module", failing)
+    monkeypatch.setattr("armcal_online.mission.run_mission", lambda *_: pytest.fail("it began first"))
     done = CliRunner().invoke(cli, ["mission", str(CONFIG), "--out", str(tmp_path / "out")])
     assert done.exit_code in (1, 2) and isinstance(done.exception, SystemExit)
     assert "Traceback" not in done.output

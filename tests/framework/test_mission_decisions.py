@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from armcal_online.mission.simulator import ArmEventSettings, CameraSettings, Event, PayloadSettings
-from armcal_online.tracking.hypotheses import LINK
+from armcal_online.hypotheses import LINK
+from armcal_online.mission_simulator import ArmEventSettings, CameraSettings, Event, PayloadSettings
 
 from tests.mission_decisions import Decision, occurrences, verdicts
 

@@ -12,8 +12,8 @@ from armcal.base.parameters import Parameters
 from armcal.estimate.estimator import Solution, SolverVerdict
 from armcal.estimate.robust import reweighted
 from armcal.problem.problem import Problem
-from armcal_online.mission.mission import MissionLog, MissionPlan, Series, error_curve
-from armcal_online.mission.simulator import DAY_S, Mission, with_payload
+from armcal_online.mission import MissionLog, MissionPlan, Series, error_curve
+from armcal_online.mission_simulator import DAY_S, Mission, with_payload
 
 from tests.mission_refits import refits, robust_fit
 

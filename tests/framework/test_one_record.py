@@ -14,8 +14,7 @@ from armcal.functions.batch_function import EvaluatorChoice
 from armcal.functions.compiler import find_compiler
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
-from armcal_online.tracking.belief import nearest_semidefinite
-from armcal_online.tracking.observer import OneRecord
+from armcal_online.belief import OneRecord, nearest_semidefinite
 
 DEMO = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "demo.yaml"
 COMPLIANCE = 0.05
@@ -102,16 +101,3 @@ def test_small_systems_are_solved_as_numpy_does_and_indefinite_ones_too() -> Non
     before = covariance.copy()
     inverse_times(covariance, right)
     assert np.array_equal(before, covariance)
-
-
-@pytest.mark.quick("8-interpreted")
-@pytest.mark.parametrize("evaluator", EVALUATORS)
-@pytest.mark.parametrize("count", [3, 8, 11])
-def test_a_few_records_at_once_are_what_they_are_one_by_one(evaluator: EvaluatorChoice, count: int) -> None:
-    """Fewer than a compiled function takes, as many, and more."""
-    _, one, values, channels = made(evaluator)
-    residuals, jacobians = one.linearise_several(values, channels[:count])
-    for i in range(count):
-        residual, jacobian = one.linearise(values, channels[i])
-        assert np.allclose(residuals[i], residual, rtol=0, atol=1e-13)
-        assert np.allclose(jacobians[i], jacobian, rtol=0, atol=1e-11)

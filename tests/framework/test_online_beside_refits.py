@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from armcal.errors import NotConvergedError
 from armcal.estimate.robust import median_norm, tuned
-from armcal_online.tracking.observer import Reading
-from armcal_online.tracking.start import FilterSetup
+from armcal_online.belief import Reading
+from armcal_online.state import FilterSetup
 from online_arm import AXES, JOINTS, NOISE_M, PROBES, STATES, World, begun, predicted
 
 pytestmark = pytest.mark.slow

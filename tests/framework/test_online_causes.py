@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.calibration.calibration import Calibration
-from armcal_online.mission.mission import MissionPlan, before_launch
+from armcal_online.mission import MissionPlan, before_launch
+from armcal_online.recalibrator import Recalibrator
 from armcal_online.sources import Incoming
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.state import Health
+from armcal_online.state import Health
 from online_arm import AXES, JOINTS, World, begun, calibration, told
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm" / "mission.yaml"

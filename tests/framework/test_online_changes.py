@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from armcal_online.tracking.recalibrator import Recalibrator
+from armcal_online.recalibrator import Recalibrator
 from online_arm import PROBES, World, begun, predicted, settings, tip_error_mm, told
 from scipy.spatial.transform import Rotation
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from armcal.estimate.online import normalised_innovation_squared
 from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
-from armcal_online.tracking.start import FilterSetup
+from armcal_online.state import FilterSetup
 from online_arm import STATES, Filtered, World, begun, begun_setup, nees, random_walk, settings, told
 from scipy.stats import chi2
 

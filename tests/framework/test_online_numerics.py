@@ -13,13 +13,11 @@ import pytest
 from armcal.base.parameters import Parameters
 from armcal.estimate.online import Gaussian
 from armcal_kalman.filters import ExtendedFilter, ExtendedSettings
+from armcal_online.belief import Belief, Observer, StateSpace
+from armcal_online.recalibrator import Recalibrator
+from armcal_online.settings import DAY
 from armcal_online.sources import Incoming
-from armcal_online.tracking.belief import Belief, StateSpace
-from armcal_online.tracking.observer import Observer
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import DAY
-from armcal_online.tracking.start import FilterSetup
-from armcal_online.tracking.state import REMEMBERED
+from armcal_online.state import REMEMBERED, FilterSetup
 from online_arm import (
     AXES,
     JOINTS,

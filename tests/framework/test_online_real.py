@@ -16,10 +16,10 @@ from armcal.estimate.online import Gaussian
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from armcal.run.result import calibration_content
+from armcal_online.belief import Belief
+from armcal_online.recalibrator import Recalibrator
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming
-from armcal_online.tracking.belief import Belief
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import RecalibrateSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.shared

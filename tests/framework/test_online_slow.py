@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 from armcal.estimate.online import Gaussian, Linearised, log_likelihood
-from armcal_online.tracking.belief import Belief, GaussMarkovStates, ProcessNoise, shared_error
-from armcal_online.tracking.hypotheses import Hypothesis, SlowChanges, SlowState
+from armcal_online.belief import Belief, GaussMarkovStates, ProcessNoise, shared_error
+from armcal_online.hypotheses import Hypothesis, SlowChanges, SlowState
 from joseph import kalman_update
 from online_arm import World, begun, settings, told
 

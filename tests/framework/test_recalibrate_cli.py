@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from armcal.cli.main import cli
-from armcal_online.running.session import ask
+from armcal_online.commands import ask
 from click.testing import CliRunner, Result
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ from typing import Any
 import pytest
 from armcal.errors import InputError
 from armcal.io.journal import Journal, JournalFullError, KeptJournal
-from armcal_online.running.loop import Pace, Recalibration
-from armcal_online.running.session import answer, opened
+from armcal_online import loop
+from armcal_online.loop import Recalibration
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming, RowParser, Sent, open_source
-from armcal_online.tracking.settings import RecalibrateSettings
-from fake_recalibrator import FakeRecalibrator, setup
+from fake_recalibrator import FakeRecalibrator, begun
 from recalibrations import (
     Listed,
     PowerCutError,
@@ -85,15 +86,14 @@ def test_a_folder_of_another_calibration_or_other_settings_is_refused(tmp_path: 
     (foreign / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match=r"thesis\.tex"):
         run(foreign, Listed([]))
-    own = setup(tmp_path / "own")
     (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "calibration.yaml").symlink_to(own.calibration)
-    with pytest.raises(InputError, match="would be replaced"), opened(own, FakeRecalibrator(), Listed([])):
-        pass
+    (tmp_path / "own" / "calibration.yaml").symlink_to(tmp_path / "own.start.yaml")
+    with pytest.raises(InputError, match="would be replaced"):
+        run(tmp_path / "own", Listed([]))
 
 
 def test_a_second_one_in_the_folder_is_refused(tmp_path: Path) -> None:
-    with opened(setup(tmp_path / "out"), FakeRecalibrator(), Listed([])), pytest.raises(InputError):
+    with begun(tmp_path / "out", FakeRecalibrator(), Listed([])), pytest.raises(InputError):
         run(tmp_path / "out", Listed([]))
 
 
@@ -104,6 +104,16 @@ def test_a_record_that_the_recalibrator_refuses_is_passed_over_for_good(tmp_path
     fake = run(folder, Listed(records))
     (ignored,) = [e for e in events(folder) if e.get("verdict") == "ignored"]
     assert "it is refused" in ignored["why"] and fake.count == 7 and replayed(folder).digest() == fake.digest()
+
+
+def test_a_record_that_a_file_has_twice_is_used_once(tmp_path: Path) -> None:
+    folder, records = tmp_path / "out", made(1, 9)
+    records.insert(5, replace(records[2], source_row=3, arrived=7.0))
+    records.insert(7, replace(records[2], channels={"arm.q1": 9.0}))
+    fake = run(folder, Listed(records))
+    (ignored,) = [e for e in events(folder) if e.get("verdict") == "ignored"]
+    assert ignored["id"] == "p3" and "came before" in ignored["why"] and fake.count == 9
+    assert len(taken(folder)) == 10 and replayed(folder).digest() == fake.digest()
 
 
 def sent(number: int, **given: Any) -> dict[str, Any]:
@@ -128,16 +138,16 @@ def test_a_record_that_is_sent_again_counts_once_and_has_the_same_acknowledgemen
 
 def test_a_sent_record_that_cannot_be_read_is_kept_with_its_fault_and_no_other_source_takes_any(tmp_path: Path) -> None:
     with stepping(tmp_path / "out", by_socket()) as (going, fake):
-        reply = answer(going, {"id": "p1", "q1_deg": 1})
+        reply = going.answer({"id": "p1", "q1_deg": 1})
         assert reply["ok"] and "missing: q2" in reply["fault"] and fake.count == 0
-        assert answer(going, {"command": "finish"})["ok"]
+        assert going.answer({"command": "finish"})["ok"]
         with pytest.raises(InputError, match="about to end"):
-            answer(going, sent(2))
+            going.answer(sent(2))
     with (
         stepping(tmp_path / "file", Listed(made(1, 9))) as (going, _),
         pytest.raises(InputError, match="--from socket"),
     ):
-        answer(going, sent(1))
+        going.answer(sent(1))
 
 
 def test_without_room_a_sent_record_has_no_acknowledgement_and_it_stops(tmp_path: Path) -> None:
@@ -145,7 +155,7 @@ def test_without_room_a_sent_record_has_no_acknowledgement_and_it_stops(tmp_path
         assert going.receive(sent(1))["ok"]
         with limited(tmp_path / "out"):
             with pytest.raises(JournalFullError):
-                answer(going, sent(2))
+                going.answer(sent(2))
             with pytest.raises(JournalFullError, match="no room for an entry"):
                 going.run()
     assert "no room for an entry" in json.loads((tmp_path / "out" / "status.json").read_text())["fault"]
@@ -155,17 +165,17 @@ def test_without_room_a_sent_record_has_no_acknowledgement_and_it_stops(tmp_path
 def test_while_paused_files_keep_their_records_and_those_of_streams_are_passed_over(tmp_path: Path) -> None:
     with stepping(tmp_path / "file", Listed(made(1, 9))) as (going, fake):
         steps(going, 3)
-        going.pause()
+        going.answer({"command": "pause"})
         steps(going, 3)
         assert fake.count == 3
-        going.resume()
+        going.answer({"command": "resume"})
         steps(going, 9)
         assert fake.count == 8
     with stepping(tmp_path / "stream", Listed(made(1, 9, key=""), keeps_records=False)) as (going, fake):
         steps(going, 2)
-        going.pause()
+        going.answer({"command": "pause"})
         steps(going, 3)
-        going.resume()
+        going.answer({"command": "resume"})
         steps(going, 3)
         assert fake.count == 5
     assert len(taken(tmp_path / "stream")) == 8
@@ -177,7 +187,7 @@ def test_while_paused_files_keep_their_records_and_those_of_streams_are_passed_o
 def test_a_pause_outlasts_a_restart(tmp_path: Path) -> None:
     with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, _):
         steps(going, 3)
-        going.pause()
+        going.answer({"command": "pause"})
     with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, fake):
         assert going.paused
         steps(going, 3)
@@ -187,20 +197,19 @@ def test_a_pause_outlasts_a_restart(tmp_path: Path) -> None:
 def test_a_rollback_restores_every_bit_and_so_does_its_journal(tmp_path: Path) -> None:
     folder, states = tmp_path / "out", {}
     with stepping(folder, Listed(made(1, 120), cut=True)) as (going, fake):
-        loop = going
         for _ in range(90):
-            loop.step(0.0)
-            states[loop.sequence] = fake.digest()
-        for target in (loop.sequence, *list(states)[70:80:3], *list(states)[:30:7]):
-            loop.roll_back(target)
+            going.step(0.0)
+            states[going.sequence] = fake.digest()
+        for target in (going.sequence, *list(states)[70:80:3], *list(states)[:30:7]):
+            going.roll_back(target)
             assert fake.digest() == states[target]
         before = fake.digest()
         for wrong in (0, 10**6):
             with pytest.raises(InputError, match="found no entry"):
-                loop.roll_back(wrong)
+                going.roll_back(wrong)
             assert fake.digest() == before
-        loop.step(0.0)
-        loop.roll_back(loop.sequence - 5)
+        going.step(0.0)
+        going.roll_back(going.sequence - 5)
         with pytest.raises(PowerCutError):
             steps(going, 100)
     after = run(folder, Listed(made(1, 120)))
@@ -227,11 +236,11 @@ def test_a_rollback_that_no_checkpoint_followed_is_made_again_after_a_restart(
 
 def test_a_full_journal_stops_it_says_so_and_keeps_all_that_was_acknowledged(tmp_path: Path) -> None:
     fake, source, out = FakeRecalibrator(), Listed(made(1, 9)), BytesIO()
-    with opened(setup(tmp_path / "out", stream=out), fake, source) as going:
+    with begun(tmp_path / "out", fake, source, out) as going:
         steps(going, 3)
         with limited(tmp_path / "out"):
             with pytest.raises(JournalFullError):
-                going.pause()
+                going.answer({"command": "pause"})
             before = fake.digest()
             with pytest.raises(JournalFullError):
                 going.roll_back(going.sequence - 1)
@@ -258,11 +267,12 @@ def test_a_crash_is_told_to_whoever_watches_and_raised(tmp_path: Path, monkeypat
     assert "division by zero" in events(tmp_path / "out")[-1]["sentence"]
 
 
-def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
-    pace = Pace(status_s=1e9, checkpoint_records=10)
+def test_the_pace_of_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"CALIBRATION_GAP_S": 1.0, "STATUS_S": 1e9, "CHECKPOINT_RECORDS": 10}.items():
+        monkeypatch.setattr(loop, name, value)
     settings = RecalibrateSettings(output={"calibration_every_records": 1000, "calibration_every_s": 1e9})
     folder = tmp_path / "out"
-    run(folder, Listed(made(1, 20)), settings, pace=pace)
+    run(folder, Listed(made(1, 20)), settings)
     assert kinds(folder).count("calibration") == 2
     with KeptJournal(folder) as journal:
         found = {journal.until(e.sequence)[0].sequence for e in journal.entries()}
@@ -274,7 +284,7 @@ def test_the_real_source_in_the_real_loop(tmp_path: Path) -> None:
     (tmp_path / "in.csv").write_text(table(10))
     fake = FakeRecalibrator()
     records = open_source(str(tmp_path / "in.csv"), RowParser(fake.request, {}))
-    with opened(setup(tmp_path / "out"), fake, records) as going:
+    with begun(tmp_path / "out", fake, records) as going:
         ends = time.monotonic() + 10
         while len(taken(tmp_path / "out")) < 10 and time.monotonic() < ends:
             going.step(0.1)

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from armcal.cli.main import cli
 from armcal.io.json_server import JsonClient
-from armcal_online.running.session import ask
-from armcal_online.running.situation import SOCKET
+from armcal_online.commands import ask
+from armcal_online.decisions import SOCKET
 from click.testing import CliRunner
 from fake_recalibrator import row
 from recalibrations import (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from armcal.errors import ConfigError
-from armcal_online.tracking.settings import load_settings
+from armcal_online.settings import load_settings
 
 
 def test_a_change_of_another_section_than_the_one_that_is_read_is_refused(tmp_path: Path) -> None:

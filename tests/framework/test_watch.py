@@ -20,8 +20,8 @@ from urllib.parse import urlsplit
 import pytest
 from armcal.cli.main import cli
 from armcal.errors import InputError
-from armcal_online.commands.watch import WatchServer, newest_events, page
-from armcal_online.running.situation import AFTER_THE_END, SOCKET, Situation, present
+from armcal_online.decisions import AFTER_THE_END, SOCKET, Situation, present
+from armcal_online.watch import WatchServer, newest_events, page
 from browser import CHROMIUM, Browser
 from click.testing import CliRunner
 
@@ -252,7 +252,7 @@ def test_bad_calls_are_told(tmp_path: Path) -> None:
 
 def test_a_watcher_stays_light() -> None:
     heavy = ("numpy", "casadi", "yaml", "pydantic")
-    script = f"import sys, armcal_online.commands.watch; print([m for m in {heavy} if m in sys.modules])"
+    script = f"import sys, armcal_online.watch; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -370,7 +370,7 @@ def test_the_wheel_holds_the_page(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
-        assert "armcal_online/commands/watch.html" in wheel.namelist()
+        assert "armcal_online/watch.html" in wheel.namelist()
 
 
 @pytest.fixture(scope="module")

@@ -20,8 +20,7 @@ from armcal.errors import ConfigError, ProblemError
 from armcal.measure.instrument import ArmsAlone
 from armcal.plugins import discover
 from armcal.problem.problem import Problem
-from armcal_capability.capability import summaries
-from armcal_capability.survey import (
+from armcal_capability.capability import (
     ORIENTATIONS,
     AreaSearch,
     AreaSettings,
@@ -39,6 +38,7 @@ from armcal_capability.survey import (
     reach_for,
     solvers_of,
     spread,
+    summaries,
     survey,
 )
 from click.testing import CliRunner, Result

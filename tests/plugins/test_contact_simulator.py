@@ -18,7 +18,7 @@ from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import ClampedTool, PlaneContact
 from armcal_dualarm.closure import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
-from armcal_simulation.contacts import ContactsSettings, ContactsSimulator
+from armcal_simulation.simulators import ContactsSettings, ContactsSimulator
 from armcal_tracker.csv_reader import CsvReader, CsvSettings
 from contact_oracle import BALL, LEFT, RIGHT, SPOTS, ball
 from scipy.spatial.transform import Rotation

@@ -11,8 +11,8 @@ import pytest
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, approach_of, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_online.mission.mission import MissionPlan
-from armcal_online.mission.simulator import (
+from armcal_online.mission import MissionPlan
+from armcal_online.mission_simulator import (
     DAY_S,
     Mission,
     MissionOfDays,

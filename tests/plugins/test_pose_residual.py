@@ -17,8 +17,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.pose_residual import Comparison, _harm
 from armcal.testing import assert_contract
 from armcal_residual.features import Products, packed, regressed, unpacked
-from armcal_residual.gaussian_process import GaussianProcess, GaussianProcessSettings
-from armcal_residual.processes import _Likelihood, _squares
+from armcal_residual.gaussian_process import GaussianProcess, GaussianProcessSettings, _Likelihood, _squares
 from compiled_arm import CompiledArm
 from outside import armcal
 from serving import ask, made

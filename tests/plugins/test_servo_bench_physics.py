@@ -14,8 +14,8 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.servo_model import JointServo, ServoHeat, ServoJointSettings
-from armcal_simulation.bench.world import BenchTruthSettings, TrackedArm
+from armcal_simulation.servos import JointServo, ServoHeat, ServoJointSettings
+from armcal_simulation.world import BenchTruthSettings, TrackedArm
 from hypothesis import given
 from hypothesis import strategies as st
 

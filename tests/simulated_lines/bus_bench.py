@@ -11,8 +11,8 @@ from armcal.arm.servo import SPLINE_TEETH
 from armcal.devices.simulated import BenchRequest, RunningBench, SimulatedBench
 from armcal.errors import ConfigError
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.safety import SafetySettings
-from armcal_simulation.bench.world import ALL, TrackedArm
+from armcal_simulation.servos import SafetySettings
+from armcal_simulation.world import ALL, TrackedArm
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import override
 

@@ -8,7 +8,7 @@ import math
 from typing import Annotated
 
 from armcal.base.settings import Torque
-from armcal_simulation.bench.servo_model import JointServo, Positive, ServoJointSettings
+from armcal_simulation.servos import JointServo, Positive, ServoJointSettings
 from pydantic import Field
 from typing_extensions import override
 

@@ -11,7 +11,7 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.settings import Duration
 from armcal.devices.live import TrackerFrame
-from armcal_simulation.bench.tracker import Fraction, TrackerModel, TrackerSettings
+from armcal_simulation.world import Fraction, TrackerModel, TrackerSettings
 from pydantic import Field, model_validator
 
 _DAY_S = 86400.0

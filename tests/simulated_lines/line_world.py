@@ -18,8 +18,8 @@ from armcal.devices.live import JointStream, Tracker, TrackerFrame
 from armcal.devices.simulated import LOG, BenchRequest, RunningBench
 from armcal.io.json_server import JsonServer, vacate
 from armcal.io.signals import Signals
-from armcal_simulation.bench.servo_model import JointServo
-from armcal_simulation.bench.world import WALL_AT_START, BenchTruthSettings, BenchWorld, FaultRequest, TrackedArm
+from armcal_simulation.servos import JointServo
+from armcal_simulation.world import WALL_AT_START, BenchTruthSettings, BenchWorld, FaultRequest, TrackedArm
 from pydantic import Field, ValidationError
 from typing_extensions import override
 

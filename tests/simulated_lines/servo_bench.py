@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 from armcal.base.settings import InputPath
 from armcal.devices.simulated import BenchRequest, RunningBench, SimulatedBench
 from armcal.run.experiment import Experiment
-from armcal_simulation.bench.servo_bench import true_servos
-from armcal_simulation.bench.servo_model import JointServo
-from armcal_simulation.bench.world import TrackedArm
+from armcal_simulation.servo_bench import true_servos
+from armcal_simulation.servos import JointServo
+from armcal_simulation.world import TrackedArm
 from pydantic import Field
 from typing_extensions import override
 

@@ -1,7 +1,8 @@
-"""A simulated bench as a whole: its truth, its arm on servos and its tracker, moved on from event to event."""
+"""A simulated bench: its truth, its arm on servos and its tracker, moved on from event to event."""
 
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,19 +15,154 @@ from armcal.arm.statics import STATICS, tilted
 from armcal.base.arrays import Array
 from armcal.base.parameters import Parameters
 from armcal.base.poses import PoseSettings, rotation_of
-from armcal.base.settings import Angle, InputPath, Settings
+from armcal.base.settings import Angle, Duration, InputPath, Length, Settings
 from armcal.config.selection import with_values
 from armcal.config.servo_file import ServoFile
 from armcal.config.yaml_source import load_config
-from armcal.devices.live import TrackerFrame
+from armcal.devices.clock import Clock
+from armcal.devices.live import REPEATED, Tracker, TrackerFrame
 from armcal.errors import ConfigError, NotConvergedError
 from armcal.functions.interpreted import BoundFunction
 from armcal.run.experiment import Experiment
 from pydantic import Field
+from typing_extensions import override
 
-from armcal_simulation.bench.safety import Safety, SafetySettings
-from armcal_simulation.bench.servo_model import JointServo, ServoHeat, ServoJointSettings
-from armcal_simulation.bench.tracker import TrackerModel, TrackerSettings
+from armcal_simulation.servos import JointServo, Safety, SafetySettings, ServoHeat, ServoJointSettings
+
+Fraction = Annotated[float, Field(ge=0, lt=1)]
+_MOST_WAITING = 10_000  # frames that nobody takes
+
+
+class TrackerSettings(Settings):
+    """Numbers of a good tracker by default.
+
+    ``noise`` is the standard deviation of each coordinate, ``orientation_noise`` of the turn about each axis of a body.
+    The bodies are ``tool`` and ``base``. A body is ``occluded`` for a fraction of the time, for ``occlusion`` on
+    average each time. ``lost_frames`` is the fraction of frames that never arrive. A frame arrives ``latency`` after
+    its moment. A tracker that was set up wrong gives positions ``length_gain`` times too large, or in a left-handed
+    frame: with its axis ``mirrored``.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 60.0
+    noise: Annotated[Length, Field(ge=0)] = 5e-5
+    orientation_noise: Annotated[Angle, Field(ge=0)] = 3e-4
+    occluded: dict[Literal["tool", "base"], Fraction] = Field(default_factory=dict)
+    occlusion: Annotated[Duration, Field(gt=0)] = 0.2
+    lost_frames: Fraction = 0.0
+    latency: Annotated[Duration, Field(ge=0)] = 0.0
+    length_gain: Annotated[float, Field(gt=0)] = 1.0
+    mirrored: Literal["none", "x", "y", "z"] = "none"
+
+
+class TrackerModel:
+    """Sees bodies, in an order that its random numbers go by. The same seed, times and poses give the same frames.
+
+    ``silent``: its frame counter goes on; ``frozen``: it sends the last frame again and again.
+    """
+
+    def __init__(self, settings: TrackerSettings, bodies: Sequence[str], random: np.random.Generator) -> None:
+        self.hidden: set[str] = set()
+        self.silent, self.counter = False, 1
+        self.frozen: Literal["no", "rising", "same"] = "no"
+        self._settings, self._bodies, self._random = settings, tuple(bodies), random
+        self._last: float | None = None
+        self._occluded: set[str] = set()
+        self._shown: TrackerFrame | None = None
+
+    def frame(self, now: float, bodies: Mapping[str, Array | None]) -> TrackerFrame | None:
+        """The frame of a moment (unix s), None if it never arrives, with bodies at ``world_T_body`` (4 x 4, m)."""
+        elapsed = 0.0 if self._last is None else now - self._last
+        self._last = now
+        poses = self._seen(bodies, elapsed)
+        is_lost = self._random.random() < self._settings.lost_frames
+        if self.frozen == "no" or self._shown is None:
+            self._shown = TrackerFrame(self.counter, now, None, poses)
+        shown = self._shown
+        if self.frozen == "rising":
+            shown = replace(shown, counter=self.counter, arrived=now)
+        self.counter += 1
+        return None if is_lost or self.silent else shown
+
+    def _seen(self, bodies: Mapping[str, Array | None], elapsed: float) -> dict[str, Array | None]:
+        """Bodies with noise; as many random numbers are drawn whether they are seen or not."""
+        noise = self._random.standard_normal((len(self._bodies), 6))
+        chances = self._random.random(len(self._bodies))
+        # an occlusion is a two-state chain with the stated fraction and mean time
+        end = min(elapsed / self._settings.occlusion, 1.0)
+        poses: dict[str, Array | None] = {}
+        occluded = {str(body): fraction for body, fraction in self._settings.occluded.items()}
+        for row, name in enumerate(self._bodies):
+            fraction = occluded.get(name, 0.0)
+            if name in self._occluded:
+                if chances[row] < end:
+                    self._occluded.discard(name)
+            elif chances[row] < end * fraction / (1 - fraction):
+                self._occluded.add(name)
+            pose = bodies.get(name)
+            is_hidden = name in self._occluded or name in self.hidden
+            poses[name] = None if is_hidden or pose is None else self._noisy(pose, noise[row])
+        return poses
+
+    def _noisy(self, pose: Array, noise: Array) -> Array:
+        x, y, z = (self._settings.orientation_noise * noise[3:]).tolist()
+        # a turn this small, to second order: Rodrigues' formula cut short
+        turn = np.array(
+            [
+                [1 - (y * y + z * z) / 2, x * y / 2 - z, x * z / 2 + y],
+                [x * y / 2 + z, 1 - (x * x + z * z) / 2, y * z / 2 - x],
+                [x * z / 2 - y, y * z / 2 + x, 1 - (x * x + y * y) / 2],
+            ]
+        )
+        disturbed = np.array(pose, dtype=float)
+        disturbed[:3, 3] += self._settings.noise * noise[:3]
+        disturbed[:3, :3] = disturbed[:3, :3] @ turn
+        disturbed[:3, 3] *= self._settings.length_gain
+        if (axis := self._settings.mirrored) != "none":
+            mirror = np.diag([-1.0 if name == axis else 1.0 for name in "xyz"])
+            disturbed[:3, :3] = mirror @ disturbed[:3, :3] @ mirror
+            disturbed[:3, 3] = mirror @ disturbed[:3, 3]
+        return disturbed
+
+
+class SimulatedTracker(Tracker):
+    """What a session opens in the place of its tracker; ``names`` are the session's own of the bodies."""
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        self._names = names
+        self._clock: Clock | None = None
+        self._repeated, self._newest = 0, 0
+        self._under_way: deque[TrackerFrame] = deque(maxlen=_MOST_WAITING)
+
+    def send(self, frame: TrackerFrame, arrives: float) -> None:
+        if self._clock is not None:
+            self._under_way.append(replace(frame, arrived=arrives))
+
+    @override
+    def open(self, clock: Clock) -> None:
+        self._clock = clock
+
+    @override
+    def frames(self) -> list[TrackerFrame]:
+        frames = []
+        while self._clock is not None and self._under_way and self._under_way[0].arrived <= self._clock.now():
+            frame = self._under_way.popleft()
+            if frame.counter <= self._newest:
+                self._repeated += 1
+                continue
+            self._newest = frame.counter
+            frames.append(replace(frame, bodies={self._names[body]: pose for body, pose in frame.bodies.items()}))
+        return frames
+
+    @property
+    @override
+    def refused(self) -> Mapping[str, int]:
+        return {REPEATED: self._repeated} if self._repeated else {}
+
+    @override
+    def close(self) -> None:
+        self._clock = None
+        self._under_way.clear()
+
 
 ALL = "all"  # in the place of a joint's name: settings of all joints, beneath each joint's own
 WALL_AT_START = 1893456000.0
@@ -39,8 +175,6 @@ _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 
 
 class FaultRequest(Settings):
-    """One fault."""
-
     kind: Literal[
         "lost", "silent", "frozen", "seen", "unplug", "replug", "reset", "brown_out", "jam", "free", "heat", "put"
     ]
@@ -74,22 +208,13 @@ class BenchTruthSettings(Settings):
     seed: Annotated[int, Field(ge=0)] = 0
 
     def servo_of(self, joint: str) -> ServoJointSettings:
-        """What kind of servo drives a joint: its own settings above those of all."""
         stated = [self.joints[name] for name in (ALL, joint) if name in self.joints]
         made = type(stated[-1]) if stated else ServoJointSettings
         return made.si(**{key: getattr(settings, key) for settings in stated for key in settings.model_fields_set})
 
 
 class TrackedArm:
-    """An arm at its true parameters, and the body on its tool that the tracker sees.
-
-    Attributes:
-        experiment: whose arm it is; ``arm``: without the effects that its servos have by themselves.
-
-    Raises:
-        ConfigError: there are several arms or measurements, the truth is refused, an effect asks for surroundings that
-            a bench does not have, or the measurement is no position.
-    """
+    """An arm at its true parameters, and the body on its tool that the tracker sees."""
 
     def __init__(self, settings: BenchTruthSettings, experiment: Experiment) -> None:
         self.experiment, system = experiment, experiment.system
@@ -118,20 +243,13 @@ class TrackedArm:
         self._deflection = np.zeros((arm.deflection_size, 1))
 
     def torques(self, angles: list[float]) -> list[float]:
-        """Holding torques (joints, N m) at joint angles (joints, rad).
-
-        They are those of the true masses on the nominal geometry, from which they hardly differ.
-        """
+        """Holding torques (joints, N m) of the true masses on the nominal geometry, from which they hardly differ."""
         self._torques.inputs[0][:] = angles
         self._torques.evaluate()
         return [float(torque) for torque in self._torques.outputs[0][0]]
 
     def pose(self, joint_angles: Array, approaches: Array) -> Array:
-        """``base_T_body`` (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1).
-
-        Raises:
-            NotConvergedError: the springs do not hold the arm there.
-        """
+        """``base_T_body`` (4x4, m) at joint angles (joints, rad) that were reached from these sides (-1, 0, 1)."""
         record = np.concatenate([joint_angles, approaches])[:, None]
         try:
             shown = self._evaluator(_NO_VALUES, record, self._deflection)
@@ -180,19 +298,7 @@ class TrackedArm:
 class BenchWorld:
     """A bench: its time, and what happens in it. A subclass has what stands between host and servos.
 
-    Attributes:
-        now: simulated seconds since the bench began.
-        servos, heat, torques: by joint; torques (N m) as of the last look.
-        tracker_model: sees the bodies; ``safety``: what was unsafe.
-
-    Args:
-        settings: the truth.
-        tracked: the arm.
-        servos: by joint, in the arm's order.
-        file: the true servo file, where pulses drive servos.
-        log: the file that takes lines on what is unsafe.
-        bodies: that the tracker sees, in an order.
-        now: when time begins.
+    Torques (N m) are as of the last look; ``file`` is the true servo file, where pulses drive servos.
     """
 
     def __init__(
@@ -241,7 +347,6 @@ class BenchWorld:
         """Time has passed for the motors."""
 
     def advance(self, seconds: float) -> None:
-        """Let time pass; all that happens in it has happened then."""
         end = self.now + seconds
         self.safety.passed(self.now)
         while self.now < end:
@@ -259,16 +364,13 @@ class BenchWorld:
                 self.safety.passed(self.now)
 
     def plan(self, *faults: FaultRequest) -> None:
-        """Have them happen at their times."""
         self._faults = sorted([*self._faults, *faults], key=lambda fault: fault.at)
 
     def run_faults(self) -> None:
-        """Do those whose time has come."""
         while self._faults and self._faults[0].at <= self.now:
             self.fail(self._faults.pop(0))
 
     def fail(self, fault: FaultRequest) -> None:
-        """Do a fault: here one of the tracker."""
         tracker, bodies = self.tracker_model, {fault.body} if fault.body else set(self._bodies)
         if fault.kind == "lost":
             tracker.hidden |= bodies
@@ -281,11 +383,9 @@ class BenchWorld:
             tracker.hidden -= bodies
 
     def commands_changed(self) -> None:
-        """Servos were commanded something else, or another torque is on them."""
         self._yielding = any(servo.gives_way(self.torques[joint]) for joint, servo in self.servos.items())
 
     def state(self) -> dict[str, Any]:
-        """The truth, as JSON."""
         base_T_body = self._body_pose()
         joints = {
             joint: {
@@ -311,7 +411,6 @@ class BenchWorld:
         }
 
     def go_on(self, before: Mapping[str, Any]) -> None:
-        """From the heat and the account of a state."""
         for joint, servo in self.servos.items():
             heat, there = self.heat[joint], before["joints"][joint]
             heat.winding, heat.case, servo.failed = there["winding"], there["case"], there["failed"]
@@ -319,7 +418,6 @@ class BenchWorld:
         self.safety.go_on(before)
 
     def _move(self, seconds: float) -> None:
-        """Let the servos drive until now, and do what is due: at most one event's time at once."""
         if seconds > 0:
             moved = False
             for joint, servo in self.servos.items():

@@ -140,11 +140,6 @@ class RecalibrateSettings(Settings):
 def load_settings(
     path: str | Path | None, overrides: Sequence[str] = (), content: bytes | None = None
 ) -> RecalibrateSettings:
-    """The settings in a file, or its ``content``, checked; the default ones without a file.
-
-    Raises:
-        ConfigError: no such file, not YAML, or a setting is refused, with file, line and field.
-    """
     if path is None:
         if overrides:
             raise ConfigError(

@@ -1,10 +1,15 @@
-"""From a calibration to what a recalibration starts with: problem, belief, noise of records and of the process."""
+"""What a recalibration starts with, what it knows between two records (as JSON to the last bit), and what it writes."""
 
+from __future__ import annotations
+
+import base64
 import fnmatch
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from datetime import UTC, datetime
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from armcal.arm.statics import gravity_tilt, unstated_payload
@@ -23,28 +28,30 @@ from armcal.calibration.calibration_file import (
 )
 from armcal.calibration.intervals import covariance_rows
 from armcal.config.selection import quantity
-from armcal.errors import ConfigError, Location
+from armcal.errors import ConfigError, DataError, Location
 from armcal.estimate.estimator import interval
 from armcal.estimate.online import Gaussian
 from armcal.measure.groups import PairedMeasurement
 from armcal.measure.measurement import Measurement
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.problem.problem import Problem
-from scipy.special import ndtri
+from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, fdtri, ndtri
 
-from armcal_online.tracking.belief import (
+from armcal_online.belief import (
     Belief,
     GaussMarkovState,
     GaussMarkovStates,
+    Observer,
     ProcessNoise,
     StateSpace,
     most_likely,
     shared_error,
     variance_rates,
 )
-from armcal_online.tracking.observer import Observer
-from armcal_online.tracking.settings import RecalibrateSettings
-from armcal_online.tracking.window_evidence import ModelError
+from armcal_online.decisions import LEVELS, Decision, Level
+from armcal_online.hypotheses import Candidate, Recent, SlowState
+from armcal_online.settings import ClockSettings, RecalibrateSettings
+from armcal_online.window_evidence import ModelError
 
 _VECTORS = ("gravity", "payload", "force", "torque")
 _SIGNIFICANT_SD = 3.0  # residuals above the stated noise by less are chance's
@@ -52,12 +59,6 @@ _SIGNIFICANT_SD = 3.0  # residuals above the stated noise by less are chance's
 
 @dataclass(frozen=True)
 class FilterSetup:
-    """What a recalibration starts with.
-
-    Attributes:
-        model_errors: what the model itself errs by, by measurement; those that err by no more than noise are left out.
-    """
-
     problem: Problem  # compiled once
     space: StateSpace  # of its free parameters
     observer: Observer  # makes observations of records
@@ -66,20 +67,10 @@ class FilterSetup:
     request: ReadRequest  # what a source should look for
     left_out: tuple[str, ...]  # measurements that cannot be taken one record at a time
     held: frozenset[str]  # parameters that are as they were calibrated until a decision opens them
-    model_errors: Mapping[str, ModelError]
+    model_errors: Mapping[str, ModelError]  # by measurement, but those that err by no more than noise
 
 
 def filter_setup(calibration: Calibration, settings: RecalibrateSettings, loads: bool = False) -> FilterSetup:
-    """What a recalibration starts with.
-
-    Args:
-        calibration: with its covariance.
-        settings: of the recalibration.
-        loads: whether a payload that no record states, and another direction of gravity, may be found.
-
-    Raises:
-        ConfigError: the calibration keeps no covariance, or a glob or a quantity in the settings is refused.
-    """
     system = calibration.system
     measurements = {n: m for n, m in system.measurements.items() if not isinstance(m, PairedMeasurement)}
     parameters, opened = _parameters(calibration, settings, loads)
@@ -200,7 +191,6 @@ def _noise_and_model_errors(
 
 
 def _freedoms(calibration: Calibration, names: Iterable[str]) -> dict[str, float]:
-    """Degrees of freedom with which the noise of measurements is known: their own, or those of the fit."""
     noise = calibration.record.noise
     own, of_fit = noise.get("scatter") or {}, max(noise["degrees_of_freedom"], 1)
     return {name: float((own.get(name) or {}).get("freedom") or of_fit) for name in names}
@@ -219,7 +209,6 @@ def _noise_scale(calibration: Calibration) -> float:
 
 
 def _full_record(calibration: Calibration, measurements: Mapping[str, Measurement]) -> Dataset:
-    """A record with everything that one may carry: functions are compiled for it."""
     arms = calibration.system.arms
     names = [w.channel for w in requested_channels(arms, measurements, measured=True) if "." in w.channel]
     names += [f"gravity_{axis}" for axis in "xyz"] + ["payload"]
@@ -253,10 +242,7 @@ def deviations(space: StateSpace, belief: Belief) -> Array:
 
 
 def calibration_text(calibration: Calibration, setup: FilterSetup, belief: Belief, source: Mapping[str, Any]) -> str:
-    """The text of calibration.yaml; ``source`` is where it comes from (records, health level, last record).
-
-    A payload that was found is stated in its statics; parameters that no decision has opened are as they were.
-    """
+    """A payload that was found is stated in its statics; parameters that no decision has opened are as they were."""
     space = setup.space
     values = most_likely(space, belief)
     covariance = belief.gaussian.covariance[: len(space.scales), : len(space.scales)]
@@ -294,10 +280,7 @@ def calibration_text(calibration: Calibration, setup: FilterSetup, belief: Belie
 def _parameter_records(
     calibration: Calibration, space: StateSpace, values: Array, free: Array, sd: Mapping[int, float]
 ) -> tuple[ParameterRecord, ...]:
-    """Every entry with its value and, where it is known, its standard deviation (``sd``, by place).
-
-    ``free`` are the values that the records alone lead to, beyond the bounds.
-    """
+    """``free`` are the values that the records alone lead to, beyond the bounds; ``sd`` is by place."""
     bounds = {
         space.parameters.entries_of(block.name).start: (block.domain.lower, block.domain.upper)
         for block in space.parameters.free
@@ -346,3 +329,217 @@ def _square_root(scales: Array, covariance: Array) -> tuple[tuple[float, ...], .
     inverse = np.where(known, 1 / np.sqrt(np.where(known, size, 1.0)), 0.0)
     root = inverse[:, None] * directions.T / scales
     return tuple(tuple(row) for row in root.tolist())
+
+
+@dataclass(frozen=True)
+class Health:
+    level: Level = "nominal"
+    calm: int = 0  # records since the last trouble
+    sentence: str = "The records agree with the calibration."  # why the level is what it is
+    best: Level = "nominal"  # it gets no better while a change is unexplained, however well the records fit
+
+    def troubled(self, level: Level, sentence: str) -> Health:
+        if LEVELS.index(level) > LEVELS.index(self.level):
+            return replace(self, level=level, calm=0, sentence=sentence)
+        return replace(self, calm=0)
+
+    def calmed(self, after: int) -> Health:
+        """After a record without trouble: better by a level once ``after`` of them came in a row."""
+        if LEVELS.index(self.level) <= LEVELS.index(self.best):
+            return self
+        if self.calm + 1 < after:
+            return replace(self, calm=self.calm + 1)
+        level = LEVELS[LEVELS.index(self.level) - 1]
+        text = f"{after} records in a row agree with the calibration"
+        if level == self.best != "nominal":
+            text += "; what changed it is not known"
+        return replace(self, level=level, calm=0, sentence=f"{text}.")
+
+
+def nis_limit(dof: int, probability: float, freedom: float = math.inf) -> float:
+    """What NIS stays below with a probability, where all is as believed.
+
+    Where few degrees of ``freedom`` determined the noise, it has an F distribution, Hotelling's [Hotelling1931].
+    """
+    if math.isinf(freedom):
+        return float(chdtri(float(dof), 1 - probability))
+    return dof * float(fdtri(float(dof), freedom, probability))
+
+
+def many_outliers(count: int, records: int, fraction: float) -> float:
+    """How probable at least ``count`` outliers among some records are, if ``fraction`` of all are."""
+    return float(bdtrc(count - 1, records, fraction)) if count > 0 else 1.0
+
+
+def improbability(nis_window: Sequence[tuple[float, int]], known: float = math.inf) -> float:
+    """How probable NIS (each with its degrees of freedom, in order) at least as large in sum are by chance.
+
+    Neighbours that resemble each other count for less than their number: by their first serial correlation.
+    """
+    if len(nis_window) < 3:
+        return 1.0
+    total, freedom = (float(sum(column)) for column in zip(*nis_window, strict=True))
+    relative = np.array([nis / dof for nis, dof in nis_window])
+    centred = relative - relative.mean()
+    power = float(centred @ centred)
+    serial = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0
+    serial = float(np.clip(serial, 0.0, 0.9))
+    shared = (1 + serial) / (1 - serial)
+    if math.isinf(known):
+        return float(chdtrc(freedom / shared, total / shared))
+    return float(fdtrc(freedom / shared, known, total / freedom))
+
+
+REMEMBERED = 128  # so many records are remembered, to name the first after a change
+
+
+@dataclass(frozen=True)
+class Clock:
+    now: float | None = None  # time (s) of the newest record
+    late: int = 0  # so many in a row have been older since
+    behind: float = 0.0  # the latest of them
+
+
+@dataclass(frozen=True)
+class Tick:
+    clock: Clock  # after a record
+    passed: float  # the time (s) that parameters had to wander
+    stale: str = ""  # why the record is
+    note: str = ""  # what was odd
+
+
+def ticked(clock: Clock, time: float | None, arrived: float, settings: ClockSettings) -> Tick:
+    """A clock that jumps ahead counts as its longest step; set back, it makes records stale until enough agree."""
+    if time is None:
+        return Tick(clock, 0.0)
+    if settings.longest_age is not None and arrived - time > settings.longest_age:
+        return Tick(clock, 0.0, f"it was measured {_span(arrived - time)} before it arrived")
+    if clock.now is None:
+        return Tick(Clock(time), 0.0)
+    step = time - clock.now
+    if step < -settings.tolerance:
+        late = clock.late + 1 if clock.late and time >= clock.behind else 1
+        if late >= settings.reset_after:
+            note = f"{late} records in a row are older than one before them: the clock is taken to have been set back"
+            return Tick(Clock(time), 0.0, note=note)
+        return Tick(replace(clock, late=late, behind=time), 0.0, f"it is {_span(-step)} older than the last record")
+    if step > settings.longest_step:
+        note = f"the clock went ahead by {_span(step)}; parameters are let wander for {_span(settings.longest_step)}"
+        return Tick(Clock(time), settings.longest_step, note=note)
+    return Tick(Clock(max(time, clock.now)), max(step, 0.0))
+
+
+def _span(seconds: float) -> str:
+    for size, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if abs(seconds) >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds:.3g} s"
+
+
+@dataclass(frozen=True)
+class Arrival:
+    record_id: str  # its own name
+    sequence: int  # its number
+    at: float  # its time (as ``State.at``)
+    is_good: bool = False  # whether it was accepted, nothing was decided, and the level was nominal after it
+
+
+@dataclass(frozen=True)
+class State:
+    """Between two records; with it and the records after, everything comes out again."""
+
+    belief: Belief  # about parameters and Gauss-Markov states
+    recent: tuple[Recent, ...] = ()  # the last records, for judgement
+    clock: Clock = field(default_factory=Clock)  # by records
+    place: float | None = None  # the last record's ``sequence``; None before the first
+    health: Health = field(default_factory=Health)  # and why
+    nis: tuple[tuple[float, int], ...] = ()  # NIS and degrees of freedom of the last accepted records
+    counts: Mapping[str, int] = field(
+        default_factory=lambda: {"accepted": 0, "rejected": 0, "ignored": 0}
+    )  # of records
+    ids: tuple[Arrival, ...] = ()  # the last records, in order
+    good: Arrival | None = None  # the last good record of those before
+    wary: bool = False  # whether the last records look like a change, which is not certain yet
+    suspects: tuple[
+        Candidate, ...
+    ] = ()  # joints that no record distinguished when one stepped, each followed by itself
+    suspected: int = 0  # the first record after that
+    before_change: Belief | None = None  # the belief before it
+    drifted: int = 0  # how often in a row the NIS as a whole was too large
+    changes: tuple[int, ...] = ()  # sequence numbers of the last changes that nothing explained
+    sequence: int = 0  # of the last entry
+    at: float = 0.0  # time of the last record (unix seconds, or as records count it)
+    slow: SlowState = field(default_factory=SlowState)  # evidence of slow changes, and trends that were found
+
+    def known(self, sequence: int) -> Arrival | None:
+        return next((arrival for arrival in reversed(self.ids) if arrival.sequence == sequence), None)
+
+    def good_before(self, sequence: int) -> Arrival | None:
+        earlier = (arrival for arrival in reversed(self.ids) if arrival.is_good and arrival.sequence < sequence)
+        return next(earlier, self.good if self.good is not None and self.good.sequence < sequence else None)
+
+    def as_dict(self) -> dict[str, Any]:
+        return dict(_encoded(self))
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> State:
+        state: State = _decoded(cls, content)
+        if set(state.counts) != {"accepted", "rejected", "ignored"}:
+            raise ValueError(f"counts of {', '.join(state.counts)}")
+        return state
+
+
+def remembering(state: State, arrival: Arrival) -> State:
+    ids = (*state.ids, arrival)
+    gone = [earlier for earlier in ids[:-REMEMBERED] if earlier.is_good]
+    return replace(state, ids=ids[-REMEMBERED:], good=gone[-1] if gone else state.good)
+
+
+def troubled(state: State, decisions: Sequence[Decision], is_good: bool) -> State:
+    """No record is good from the first that a decision affects."""
+    since = min((decision.since for decision in decisions), default=state.sequence + 1)
+    *earlier, newest = (replace(a, is_good=False) if a.sequence >= since else a for a in state.ids)
+    return replace(state, ids=(*earlier, replace(newest, is_good=is_good)))
+
+
+def _encoded(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        raw = np.ascontiguousarray(value, dtype="<f8").tobytes()
+        return {"shape": list(value.shape), "float64": base64.b64encode(raw).decode("ascii")}
+    if isinstance(value, Belief):  # of its covariance, which is symmetric, the lower triangle
+        mean, covariance = value.gaussian.mean, value.gaussian.covariance
+        triangle = covariance[np.tril_indices(len(covariance))]
+        return _encoded({"origin": value.origin, "mean": mean, "covariance": triangle})
+    if is_dataclass(value):
+        return {field.name: _encoded(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: _encoded(item) for key, item in value.items()}
+    return [_encoded(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _decoded(kind: Any, content: Any) -> Any:
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is np.ndarray:
+        raw = np.frombuffer(base64.b64decode(content["float64"]), dtype="<f8")
+        if raw.size != int(np.prod(content["shape"])):
+            raise DataError("an array in the journal is not whole.", hint="Start again from the last calibration.yaml.")
+        return np.array(raw.reshape(content["shape"]), dtype=float)
+    if kind is Belief:
+        place, mean, triangle = (_decoded(Array, content[name]) for name in ("origin", "mean", "covariance"))
+        covariance = np.zeros((len(mean), len(mean)))
+        rows, columns = np.tril_indices(len(mean))
+        covariance[rows, columns] = covariance[columns, rows] = triangle
+        return Belief(place, Gaussian(mean, covariance))
+    if isinstance(kind, type) and is_dataclass(kind):
+        kinds = get_type_hints(kind)
+        return kind(**{field.name: _decoded(kinds[field.name], content[field.name]) for field in fields(kind)})
+    if origin is UnionType:
+        return None if content is None else _decoded(parts[0], content)
+    if origin is tuple:
+        kinds_of = parts[:1] * len(content) if parts[-1] is Ellipsis else parts
+        return tuple(_decoded(one, item) for one, item in zip(kinds_of, content, strict=True))
+    if origin is Mapping:
+        return {str(key): _decoded(parts[1], item) for key, item in content.items()}
+    if origin is Literal and content not in parts:
+        raise ValueError(f"{content!r} is none of {', '.join(parts)}")
+    return content if origin is Literal else kind(content)

@@ -213,7 +213,6 @@ class Truth:
 
     @classmethod
     def over(cls, parameters: Parameters, settings: MissionSettings, random: np.random.Generator) -> Self:
-        """Raises ConfigError: no such parameter, no single number, or a wrong unit."""
         paths, end = list[tuple[int, Array, Array]](), settings.days * DAY_S
         for glob, text in settings.creep.items():
             paths += [_path(parameters, name, text, (0.0, end), random) for name in parameters.select([glob])]
@@ -236,7 +235,6 @@ class Truth:
         return cls(parameters, tuple(paths), warmings, settings.temperature, tuple(cameras))
 
     def values_at(self, times: Array) -> Array:
-        """Value vectors (N x entries, SI)."""
         values = np.tile(self.parameters.nominal(), (len(times), 1))
         for entry, moments, changes in self.paths:
             values[:, entry] += np.interp(times, moments, changes)
@@ -246,7 +244,6 @@ class Truth:
         return values
 
     def temperature_at(self, times: Array) -> Array:
-        """N, degrees Celsius."""
         sine = self.temperature
         return sine.mean + sine.swing * np.cos(2 * np.pi * (times - sine.warmest * HOUR_S) / sine.period)
 
@@ -266,7 +263,6 @@ class Truth:
 def _path(
     parameters: Parameters, name: str, text: str | float, span: tuple[float, float], random: np.random.Generator
 ) -> tuple[int, Array, Array]:
-    """A jump, or a change over time, as it is written."""
     block, entry, (begin, end) = parameters[name], _entry(parameters, name), span
     if not (isinstance(text, str) and " in " in text):
         return entry, np.array([begin, begin]), np.array([0.0, quantity(block, text, None, ())])
@@ -300,8 +296,6 @@ class Mission:
 
 
 class MissionOfDays:
-    """The simulator ``mission``."""
-
     Settings: ClassVar[type[MissionSettings]] = MissionSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
         "truth": "truth.yaml",
@@ -351,7 +345,6 @@ class MissionOfDays:
         )
 
     def _commands(self, arm: Arm, times: Array, truth: Truth, random: np.random.Generator) -> Dataset:
-        """Random commands, and when the arm is there; nothing is said of what hangs on the tool."""
         records, keys = self._settings.records, ("simulation.records.ranges", "simulation.records.travel")
         stated = by_dimension(arm.commanded, records.ranges, records.travel, keys)
         positions: list[Array] = []
@@ -390,7 +383,6 @@ def with_payload(parameters: Parameters) -> Parameters:
 
 
 def record_times(days: float, records: RecordSettings, random: np.random.Generator) -> Array:
-    """When the arm is measured, s since the mission began, in order."""
     first, last = (hour * HOUR_S for hour in records.hours)
     times: list[float] = []
     for day in range(int(np.ceil(days))):

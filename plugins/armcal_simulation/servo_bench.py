@@ -33,9 +33,16 @@ from armcal.errors import ConfigError, InputError, Location
 from armcal.io.plain_files import write_whole
 from typing_extensions import override
 
-from armcal_simulation.bench.servo_model import JointServo
-from armcal_simulation.bench.tracker import SimulatedTracker
-from armcal_simulation.bench.world import ALL, WALL_AT_START, BenchTruthSettings, BenchWorld, FaultRequest, TrackedArm
+from armcal_simulation.servos import JointServo
+from armcal_simulation.world import (
+    ALL,
+    WALL_AT_START,
+    BenchTruthSettings,
+    BenchWorld,
+    FaultRequest,
+    SimulatedTracker,
+    TrackedArm,
+)
 
 EXAMPLE_SERVOS = Path(__file__).with_name("example_servos.yaml")
 TICK_S = 0.02  # of the board's watchdog
@@ -64,7 +71,6 @@ class Wire:
         return 2 * math.pi / 4096
 
     def position(self, angle: float) -> float:
-        """What is written to the servo for a commanded angle (rad)."""
         return angle
 
     def rate(self, rate: float) -> float:
@@ -72,11 +78,9 @@ class Wire:
         return rate
 
     def angle(self, position: float) -> float:
-        """The commanded angle (rad) of what is written."""
         return position
 
     def arriving(self, position: float) -> float:
-        """What reaches the servo."""
         return self.direction * position + self.off
 
     def read(self, shaft: float) -> float:
@@ -86,8 +90,6 @@ class Wire:
 
 @dataclass(frozen=True, kw_only=True)
 class PulseWire(Wire):
-    """One to a servo that takes pulses (s): whole counts of a clock that runs other than is stated."""
-
     stated: PulseTable
     clock: PulseClock
     true_clock: PulseClock
@@ -115,11 +117,7 @@ class PulseWire(Wire):
 
 
 def true_servos(settings: BenchTruthSettings, joints: Collection[str], stated: Path | None = None) -> ServoFile | None:
-    """Boards and servos as they are, by the settings' servo file or the device's; None where there is neither.
-
-    Raises:
-        ConfigError: the file is refused, or names other joints than the arm has.
-    """
+    """Boards and servos as they are, by the settings' servo file or the device's; None where there is neither."""
     if fault := unknown_joint([name for name in (*settings.joints, *settings.start) if name != ALL], joints):
         raise ConfigError(f"bench.simulator: {fault}.")
     if fault := unknown_joint([fault.joint for fault in settings.faults if fault.joint is not None], joints):
@@ -160,18 +158,6 @@ class RunningServoBench(BenchWorld, RunningBench):
 
     The board's watchdog drives the arm when its host falls silent. The state is kept in the folder, and gone on from
     when it is there.
-
-    Attributes:
-        wires: by the device's joints, to which servos they lead.
-        positions: by the device's joints, what is written to those that are driven (counts, or rad); others hang free.
-        boots: how often the board has started.
-        is_there: it can be reached; unplugged it goes on by its own power.
-        took_over: it has begun to drive, and no host has taken over again.
-        calibrated: a fingerprint of what a calibration of the device hangs on.
-
-    Raises:
-        ConfigError: the settings do not fit the experiment.
-        InputError: what is kept in the folder is no bench's.
     """
 
     def __init__(self, settings: BenchTruthSettings, request: BenchRequest) -> None:
@@ -181,7 +167,8 @@ class RunningServoBench(BenchWorld, RunningBench):
         stated = None if path is None else load_servo_file(path)
         true = true_servos(settings, tracked.arm.commanded, path)
         true = None if stated is None else true
-        self.wires = _wires(settings, tracked.arm, stated, true)
+        self.wires = _wires(settings, tracked.arm, stated, true)  # to which servos the device's joints lead
+        # A fingerprint of what a calibration of the device hangs on.
         self.calibrated = identity_of({"device": str(source.data.get("bench", {}).get("device"))})
         if stated is not None:
             self.calibrated = digest({joint: stated.calibrated(joint) for joint in self.wires})
@@ -192,8 +179,10 @@ class RunningServoBench(BenchWorld, RunningBench):
             angle = before["joints"][joint]["shaft_rad"] if before else settings.start.get(joint, 0.0)
             table = None if true is None else true.servos[joint].table
             servos[joint] = JointServo(settings.servo_of(joint), angle, table)
+        # Of joints that are driven, what is written to them (counts, or rad); others hang free.
         self.positions: dict[str, float] = dict(before["board"]["positions"]) if before else {}
-        self.boots, self.is_there = before["board"]["boots"] if before else 1, True
+        self.boots = before["board"]["boots"] if before else 1  # how often the board has started
+        self.is_there = True  # it can be reached; unplugged it goes on by its own power
         for name, position in self.positions.items():  # those that held hold on
             wire = self.wires[name]
             if wire.joint is not None:
@@ -241,7 +230,6 @@ class RunningServoBench(BenchWorld, RunningBench):
             self.commands_changed()
 
     def heard(self) -> None:
-        """The host lives."""
         self._heard = self.now
 
     def guard(self, waypoints: Sequence[Mapping[str, float]], rates: Mapping[str, float], after_s: float) -> None:
@@ -249,12 +237,10 @@ class RunningServoBench(BenchWorld, RunningBench):
         self._waypoints, self._rates, self._after_s = tuple(waypoints), dict(rates), after_s
 
     def take(self) -> None:
-        """A host takes over again: the drive stops where it stands."""
         self.took_over, self._next_tick = False, math.inf
         self.heard()
 
     def encoder_angle(self, joint: str) -> float:
-        """The angle (rad) that the device reads of a joint's encoder."""
         wire = self.wires[joint]
         servo = self.servos[joint if wire.joint is None else wire.joint]
         return wire.read(servo.shaft + servo.settings.encoder_noise * float(self._encoders.standard_normal()))
@@ -310,12 +296,10 @@ class RunningServoBench(BenchWorld, RunningBench):
         super().fail(fault)
 
     def _forget(self) -> None:
-        """The board starts anew."""
         self.guard((), {}, 0.0)
         self.take()
 
     def _driven(self) -> Iterator[bool]:
-        """Through the waypoints, a step at each tick."""
         for waypoint in self._waypoints:
             # joints that hang free stay so: nobody knows where their servos stand
             start = {name: self.positions[name] for name in waypoint if name in self.positions}
@@ -329,7 +313,6 @@ class RunningServoBench(BenchWorld, RunningBench):
                 yield False
 
     def _before(self) -> dict[str, Any]:
-        """The state that is there; empty if none is."""
         try:
             before: dict[str, Any] = json.loads(self._account.read_bytes())
             _ = before["now"] + before["board"]["boots"]
@@ -372,14 +355,6 @@ class WorldClock(Clock):
 
 
 class SimulatedDevice(JointDevice):
-    """The same joints and angles as the configured device's, on the simulated board.
-
-    Args:
-        configured: names the joints, and knows which angles can be set. It is never opened.
-        bench: has the board.
-        is_guarded: whether the configured board looks after the arm when its host falls silent.
-    """
-
     def __init__(self, configured: JointDevice, bench: RunningServoBench, is_guarded: bool) -> None:
         self._configured, self._bench, self._is_guarded = configured, bench, is_guarded
         self._boots: int | None = None
@@ -452,11 +427,6 @@ class SimulatedDevice(JointDevice):
             self._bench.write(joint, position)
 
     def _reach(self) -> None:
-        """The board hears of its host.
-
-        Raises:
-            DeviceError: it does not, or has started anew or taken over since it was opened.
-        """
         board = self._bench
         fault: DeviceError | None = None
         if self._boots is None or not board.is_there:
@@ -473,8 +443,6 @@ class SimulatedDevice(JointDevice):
 
 
 class SimulatedPulseDevice(SimulatedDevice, PulseDevice):
-    """One whose servos take pulses."""
-
     @override
     def set_pulse(self, joint: str, pulse: float) -> float:
         wire = self._bench.wires[joint]
@@ -486,8 +454,6 @@ class SimulatedPulseDevice(SimulatedDevice, PulseDevice):
 
 
 class SimulatedMeasuringDevice(SimulatedDevice, MeasuringDevice):
-    """One whose servos know where they stand, and how hot they are."""
-
     def __init__(self, configured: JointDevice, bench: RunningServoBench, is_guarded: bool) -> None:
         super().__init__(configured, bench, is_guarded)
         self._reported: set[str] = set()

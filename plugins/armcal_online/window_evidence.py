@@ -19,10 +19,9 @@ from armcal.estimate.validation import error_dimension, error_unit
 from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.lapack import dposv
 
-from armcal_online.tracking.belief import Belief, ProcessNoise, StateSpace
-from armcal_online.tracking.hypotheses import Candidate, Explanation, Hypothesis, Recent, Steps
-from armcal_online.tracking.observer import Observer, linearised
-from armcal_online.tracking.settings import OutlierSettings
+from armcal_online.belief import Belief, Observer, ProcessNoise, StateSpace
+from armcal_online.hypotheses import Candidate, Explanation, Hypothesis, Recent, Steps
+from armcal_online.settings import OutlierSettings
 
 SHOWN = {
     "angle": ("size_deg", "deg", math.degrees(1.0)),
@@ -38,12 +37,10 @@ _CLEAR = 3.0  # so many standard deviations from zero a number is worth saying
 
 @dataclass(frozen=True)
 class Size:
-    """Of a change, and its standard deviation (rad, m or kg by ``dimension``, empty where it has none); in words."""
-
-    value: float = 0.0
+    value: float = 0.0  # of a change (rad, m or kg)
     deviation: float = 0.0
-    dimension: str = ""
-    shown: str = ""
+    dimension: str = ""  # empty where it has none
+    shown: str = ""  # in words
 
 
 def size_of(space: StateSpace, steps: Steps, before: Belief, after: Belief, change: Hypothesis) -> Size:
@@ -78,7 +75,6 @@ def rate_of(steps: Steps, change: Hypothesis, size: Array, covariance: Array) ->
 
 
 def _with_centre(space: StateSpace, moved: Array, covariance: Array, mass: Size) -> Size:
-    """A payload with its centre in the tool frame, where the mass and the centre are known."""
     if abs(mass.value) < _CLEAR * mass.deviation:
         return mass
     at = [space.names.index(f"statics.payload_moment_{axis}") for axis in "xyz"]
@@ -118,34 +114,19 @@ def _sized(value: float, deviation: float, dimension: str) -> Size:
 
 @dataclass(frozen=True)
 class TipError:
-    """The median size of an error, in thousandths of SI; how it was found, as words to go after it.
-
-    ``unit`` is mm, or mrad where nothing measured is a length.
-    """
-
-    size: float
-    unit: str
-    source: str
+    size: float  # median of the errors
+    unit: str  # mm, or mrad where nothing measured is a length
+    source: str  # how it was found, in words
 
 
 def tip_error(
     observer: Observer, recent: Sequence[Recent], since: int, before: Belief, after: Belief
 ) -> TipError | None:
-    """The error of the predicted readings before a decision.
+    """The error of the predicted readings before a decision; None where no reading has a length (or an angle).
 
     Where the decision explains the records by a move of the estimate, it is how far the predictions move at the last
     recorded poses, free of noise. Where it does not, nothing better is known than how far the readings since lie from
     their predictions.
-
-    Args:
-        observer: of the recalibration.
-        recent: the last records, in order.
-        since: the number of the first record that the decision affects.
-        before: the belief without the decision.
-        after: the belief that explains the records; the one before where nothing does.
-
-    Returns:
-        None where no reading has a length (or an angle, where nothing measured is a length), or none is predictable.
     """
     space = observer.space
     old, new = (space.inside(belief.values(space)) for belief in (before, after))
@@ -179,10 +160,8 @@ def _sizes(observer: Observer, record: Recent, old: Array, new: Array | None) ->
 
 @dataclass(frozen=True)
 class ModelError:
-    """The covariance of what a model itself errs by (n_r x n_r), and degrees of freedom with which it is known."""
-
-    covariance: Array
-    freedom: float
+    covariance: Array  # of what a model itself errs by (n_r x n_r)
+    freedom: float  # degrees of freedom with which that is known
 
 
 def in_model_errors(
@@ -190,11 +169,8 @@ def in_model_errors(
 ) -> tuple[float, float]:
     """How far predictions of records move between beliefs, in standard deviations of what was open before.
 
-    That is the model's own error, and what its parameters leave.
-
-    Returns:
-        the root mean square, and the log density of an error as large against that of none; infinitely far where the
-        model has no error of its own.
+    That is the model's own error, and what its parameters leave: the root mean square, and the log density of an error
+    as large against that of none; infinitely far where the model has no error of its own.
     """
     space, squares, densities = observer.space, [], []
     n = len(space.scales)
@@ -217,29 +193,16 @@ def in_model_errors(
 
 
 @dataclass(frozen=True)
-class Density:
-    """A log density, and the squared Mahalanobis distance in it."""
-
-    log_density: float
-    nis: float
-
-
-@dataclass(frozen=True)
 class JointDensity:
-    """Innovations of records (m), their joint covariance (m x m), and the rows of each record."""
-
-    innovation: Array
+    innovation: Array  # of records (m)
     covariance: Array
-    rows: Sequence[slice]
+    rows: Sequence[slice]  # of each record
 
-    def log_densities(self, chosen: Mask, freedom: float) -> tuple[Density, Array]:
-        """The density of chosen records, and what it becomes with each record taken out of them, or put to them (n).
+    def log_densities(self, chosen: Mask, freedom: float) -> tuple[float, float, Array]:
+        """Log density and NIS of chosen records, and the density with each record taken out or put to them (n).
 
         Both come from one factorisation: a record less divides by its density given the others, which the blocks of
         the inverse give [Rasmussen2006]; a record more multiplies by it.
-
-        Raises:
-            LinAlgError: the covariance is not positive definite.
         """
         inside = np.flatnonzero(np.repeat(chosen, [own.stop - own.start for own in self.rows]))
         covariance, innovation = self.covariance[np.ix_(inside, inside)], self.innovation[inside]
@@ -260,7 +223,7 @@ class JointDensity:
                 distance, log_volume = _solved(given, self.innovation[own] - across @ weighted)
                 parts = nis + distance, log_determinant + log_volume, len(inside) + size
             changed[i] = log_density(*parts, freedom)
-        return Density(log_density(nis, log_determinant, len(inside), freedom), nis), changed
+        return log_density(nis, log_determinant, len(inside), freedom), nis, changed
 
 
 def _solved(covariance: Array, innovation: Array) -> tuple[float, float]:
@@ -277,13 +240,9 @@ _SIZES = ((1.0, 0.5), (3.0, 0.25), (10.0, 0.125), (30.0, 0.125))
 
 
 def log_density_of_outlier(innovation: Array, expected: Array, stated: Array, freedom: float) -> float:
-    """Log density of a wrong record, of the size that makes it likeliest.
+    """Of the size that makes it likeliest.
 
-    Args:
-        innovation: of the record (m).
-        expected: its covariance if the record were a good one (m x m).
-        stated: covariance of an error of the stated size (m x m).
-        freedom: degrees of freedom with which the noise is known.
+    ``expected`` is its covariance if it were a good one, ``stated`` that of an error of the stated size (m x m).
     """
     return max(
         math.log(probability) + log_likelihood(innovation, expected + size**2 * stated, freedom)
@@ -300,39 +259,21 @@ _GAIN = 1e-9
 
 @dataclass(frozen=True)
 class Weighed:
-    """A change, weighed: log likelihood of the records, its likeliest shift (k; standard deviations), which fit.
-
-    ``nis`` is the squared Mahalanobis distance of those that fit.
-    """
-
-    log_likelihood: float
-    shift: Array
-    fits: Mask
-    nis: float
+    log_likelihood: float  # of the records
+    shift: Array  # the likeliest (k; standard deviations)
+    fits: Mask  # which records do
+    nis: float  # of those
 
 
 class RecordsSince:
-    """Records since a change, about the belief before the first of them.
-
-    Args:
-        records: in order; the distance to the first from the one before is not used.
-        observer: of the problem.
-        process_noise: of beliefs.
-        outlier_covariances: of an outlier's error of the stated size, a record each.
-        share: of outliers.
-        freedom: degrees of freedom with which the records' noise is known.
-    """
+    """Records since a change, about the belief before the first of them; each may be an outlier."""
 
     def __init__(
-        self,
-        records: Sequence[Recent],
-        observer: Observer,
-        process_noise: ProcessNoise,
-        outlier_covariances: Sequence[Array],
-        share: float,
-        freedom: float,
+        self, records: Sequence[Recent], observer: Observer, process_noise: ProcessNoise, outliers: OutlierSettings
     ) -> None:
-        self._freedom, self._n = freedom, len(process_noise.rates)
+        share, errors = outliers.fraction, [_outlier_covariance(observer, r, outliers) for r in records]
+        self._freedom = freedom = min(observer.freedom(r.readings) for r in records)
+        self._n = len(process_noise.rates)
         belief = before = records[0].before
         self._observations = [observer.observation(before, r.readings, r.joint_noise) for r in records]
         gaussian, count = before.gaussian, len(records)
@@ -345,7 +286,7 @@ class RecordsSince:
         self._left = np.ones((count, count, len(gaussian.mean) - self._n))
         for i, j in combinations(range(count), 2):
             self._left[i, j] = np.prod(kept[i:j], axis=0)
-        self._unmoved = linearised(self._observations, self._means)
+        self._unmoved = [one.at(mean) for one, mean in zip(self._observations, self._means, strict=True)]
         self._roots: dict[tuple[bytes, float], tuple[Array, bool]] = {}
         # An outlier says nothing about the arm: its density is the same whatever has changed.
         self._log_outliers = (
@@ -354,17 +295,13 @@ class RecordsSince:
                 [
                     math.log(share)
                     + log_density_of_outlier(r.innovation, r.slope @ prior @ r.slope.T + r.noise, error, freedom)
-                    for r, prior, error in zip(self._unmoved, self._priors, outlier_covariances, strict=True)
+                    for r, prior, error in zip(self._unmoved, self._priors, errors, strict=True)
                 ]
             ),
         )
 
     def weigh(self, directions: Array, factor: float = 1.0) -> Weighed:
-        """A change that reopens ``directions`` (N x k) and makes standard deviations of parameters larger.
-
-        Raises:
-            NotConvergedError: the arm has no elastic equilibrium where the change leads.
-        """
+        """A change that reopens ``directions`` (N x k) and makes standard deviations of parameters larger."""
         shift, fits = np.zeros(directions.shape[1]), np.ones(len(self._observations), dtype=bool)
         best: Weighed | None = None
         for _ in range(_ROUNDS):
@@ -384,8 +321,7 @@ class RecordsSince:
         if not shift.any():
             return self._unmoved
         moved = directions @ shift
-        points = {id(mean): mean + moved for mean in self._means}
-        return linearised(self._observations, [points[id(mean)] for mean in self._means])
+        return [one.at(mean + moved) for one, mean in zip(self._observations, self._means, strict=True)]
 
     def _likeliest_shift(self, directions: Array, shift: Array, fits: Mask, factor: float) -> Array:
         """By the records that fit (k; in standard deviations), weighted as without the change."""
@@ -411,13 +347,13 @@ class RecordsSince:
         innovation, slope, covariance, rows = self._stacked(self._records(directions, shift), every, factor)
         across = slope @ directions
         joint = JointDensity(innovation + across @ shift, covariance + across @ across.T, rows)
-        log_good, chosen, best, nis = self._log_outliers[0], fits.copy(), -np.inf, 0.0
+        log_good, chosen = self._log_outliers[0], fits.copy()
         while True:
-            here, changed = joint.log_densities(chosen, self._freedom)
+            density, nis, changed = joint.log_densities(chosen, self._freedom)
             outside = float(self._log_outliers[1][~chosen].sum())
             own = np.where(chosen, self._log_outliers[1] - log_good, log_good - self._log_outliers[1])
-            best, nis = here.log_density + float(chosen.sum()) * log_good + outside, here.nis
-            gains = changed - here.log_density + own
+            best = density + float(chosen.sum()) * log_good + outside
+            gains = changed - density + own
             i = int(np.argmax(gains))
             if gains[i] <= _GAIN:
                 return Weighed(best, shift, chosen, nis)
@@ -448,8 +384,6 @@ class RecordsSince:
 
 
 class HypothesisFilter:
-    """Weighs hypotheses by the last records, and follows them."""
-
     def __init__(
         self, observer: Observer, estimator: OnlineEstimator, process_noise: ProcessNoise, outliers: OutlierSettings
     ) -> None:
@@ -460,16 +394,11 @@ class HypothesisFilter:
     def compare(
         self, recent: Sequence[Recent], large: Sequence[int], changes: Sequence[Hypothesis], least: int = 1
     ) -> list[Explanation]:
-        """Every hypothesis from its likeliest onset, the likeliest first.
-
-        ``large`` are records that do not fit; an onset has at least ``least`` of them from it on.
-        """
+        """All from their likeliest onset, with ``least`` of the ``large`` records or more since; likeliest first."""
         likeliest: dict[int, Explanation] = {}
         for onset in large[-_MOST_ONSETS : len(large) + 1 - least]:
             records = recent[onset:]
-            errors, known = [self._outlier_covariance(r) for r in records], min(map(self.freedom, records))
-            parts = (self._observer, self._process_noise, errors, self._outliers.fraction, known)
-            since = RecordsSince(records, *parts)
+            since = RecordsSince(records, self._observer, self._process_noise, self._outliers)
             none = since.weigh(np.zeros((self._observer.size, 0))).log_likelihood
             misfits = [i - onset for i in large if i >= onset]
             rejected = [i for i in misfits if records[i].rejected]
@@ -509,7 +438,7 @@ class HypothesisFilter:
         observation = self._observer.observation(belief, record.readings, record.joint_noise)
         try:
             first = observation.at(belief.gaussian.mean)
-            freedom, stated = self.freedom(record), self._outlier_covariance(record)
+            freedom, stated = self.freedom(record), _outlier_covariance(self._observer, record, self._outliers)
             outside = np.log(share) + log_density_of_outlier(first.innovation, first.noise, stated, freedom)
             update = self._estimator.update(belief.gaussian, observation)
         except ArmcalError:
@@ -522,8 +451,9 @@ class HypothesisFilter:
     def freedom(self, record: Recent) -> float:
         return self._observer.freedom(record.readings)
 
-    def _outlier_covariance(self, record: Recent) -> Array:
-        kernels = self._observer.problem.kernels
-        size = {"length": self._outliers.length, "angle": self._outliers.angle}
-        deviations = [size[d] for reading in record.readings for d in kernels[reading.factor].factor.dimensions]
-        return np.diag(np.array(deviations) ** 2)
+
+def _outlier_covariance(observer: Observer, record: Recent, outliers: OutlierSettings) -> Array:
+    """Of an error of the stated size."""
+    kernels, size = observer.problem.kernels, {"length": outliers.length, "angle": outliers.angle}
+    deviations = [size[d] for reading in record.readings for d in kernels[reading.factor].factor.dimensions]
+    return np.diag(np.array(deviations) ** 2)

@@ -9,31 +9,37 @@ standard deviation whose correlation falls by e over a distance (Ornstein-Uhlenb
 time, coordinates of the belief after those of the parameters. One that is a drift moves a parameter; one of a shared
 error, the part of the model's error that neighbouring records have in common, shifts what an instrument reads.
 
-Scaled coordinates about a value vector, and back: the space of a belief about parameters.
-
-Numbers between bounds and entries of semidefinite matrices are moved as they are, even out of their domain: the belief
-stays the Gaussian that the records make, and only what is taken from it is brought inside (see ``inside`` and
-``belief.most_likely``). Rotations, poses and screw axes are moved within their domain.
+Numbers between bounds and entries of semidefinite matrices are moved out of their domain too: only what is taken from a
+belief is brought inside (``inside``, ``most_likely``). Rotations, poses and screw axes are moved within their domain.
 """
 
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from armcal.arm.evaluator import MOST_DEFLECTION
 from armcal.base.arrays import Array, Indices
+from armcal.base.dataset import Dataset
 from armcal.base.domains import Interval, Semidefinite, symmetric
 from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.units import amount_in_time
 from armcal.config.selection import quantity
-from armcal.errors import ConfigError, Location
-from armcal.estimate.online import Gaussian, checked
+from armcal.errors import ConfigError, DataError, Location
+from armcal.estimate.online import Gaussian, Linearised, Observation, checked
+from armcal.functions.c_source import LANES
+from armcal.measure.groups import NO_GROUP, group_key, group_name, group_numbers, owner_of
+from armcal.measure.measurement import GroupedMeasurement
+from armcal.problem.kernel import HELD, Compiled, Kernel
+from armcal.problem.problem import Problem
 from armcal.problem.records import kept, passed_on
+from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
+from typing_extensions import override
 
 _ENTRIES = np.triu_indices(3)
 
@@ -46,12 +52,10 @@ class StateSpace:
 
     @cached_property
     def scales(self) -> Array:
-        """The typical scale of each coordinate (n)."""
         return self.parameters.scales()
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the coordinates (n)."""
         return self.parameters.coordinate_names
 
     @cached_property
@@ -117,7 +121,6 @@ class StateSpace:
         return whole * self.scales
 
     def of_entries(self, values: Array, covariance: Array) -> Array:
-        """A covariance of the free entries as one of scaled coordinates (n x n)."""
         chain = self.chain(values)
         if chain is None:
             return np.asarray(covariance / np.outer(self.scales, self.scales))
@@ -157,7 +160,6 @@ class StateSpace:
 
     @cached_property
     def _matrices(self) -> Indices:
-        """Of semidefinite blocks, the places of their entries in a value vector (blocks x 6)."""
         return _positions(entries for entries, _ in self.cones).reshape(-1, 6)
 
 
@@ -203,7 +205,6 @@ class Belief:
         return Belief(origin, Gaussian(mean, self.gaussian.covariance))
 
     def widened(self, count: int, factor: float) -> Belief:
-        """The belief with the standard deviations of its first ``count`` coordinates multiplied."""
         scale = np.ones(len(self.gaussian.mean))
         scale[:count] = factor
         return Belief(self.origin, Gaussian(self.gaussian.mean, self.gaussian.covariance * scale[:, None] * scale))
@@ -259,8 +260,6 @@ def _nearest_in_cones(root: Array, given: Array, ends: tuple[Array, Array], scal
 
 @dataclass(frozen=True)
 class GaussMarkovState:
-    """One process."""
-
     name: str  # for people
     over: float  # the distance over which it forgets, in units of the channel
     channel: str  # ``sequence`` (places in a recording), ``record`` (one by one) or ``time`` (s)
@@ -272,8 +271,6 @@ class GaussMarkovState:
 
 @dataclass(frozen=True)
 class GaussMarkovStates:
-    """All of them (m)."""
-
     states: tuple[GaussMarkovState, ...] = ()
 
     def __len__(self) -> int:
@@ -307,8 +304,6 @@ def shared_error(instance: str, covariance: Array, over: float, channel: str) ->
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """How a belief widens between records."""
-
     rates: Array  # variance that each parameter's scaled coordinate gains in a second (n)
     gauss_markov: GaussMarkovStates  # the states beside the parameters
 
@@ -328,15 +323,7 @@ class ProcessNoise:
 
 
 def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
-    """Variance that each free coordinate gains, in its scaled unit squared per s (n).
-
-    Args:
-        parameters: with the free ones.
-        stated: by glob, a standard deviation and the time in which it comes about: ``0.05 deg in 30 d``.
-
-    Raises:
-        ConfigError: a glob matches nothing, or nothing free; a text is no such rate.
-    """
+    """Variance that each free coordinate gains, in its scaled unit squared per s (n)."""
     rates = {block.name: 0.0 for block in parameters.free}
     for glob, text in stated.items():
         where = Location(f"process_noise.{glob}")
@@ -362,3 +349,213 @@ def variance_rates(parameters: Parameters, stated: Mapping[str, str]) -> Array:
             deviation = quantity(block, size, None, ())
             rates[name] = (deviation / block.scale) ** 2 / seconds
     return np.array([rates[block.name] for block in parameters.coordinate_blocks])
+
+
+class OneRecord:
+    """A factor's residual and Jacobian in buffers for one record; not to be shared between threads.
+
+    The elastic equilibrium starts from rest each time: what comes out is a function of values and record alone, to the
+    last bit.
+    """
+
+    def __init__(self, kernel: Kernel) -> None:
+        factor, backend = kernel.factor, kernel.backend
+        self._kernel, self._sizes = kernel, (factor.rows, factor.values.numel())
+        counts = (len(factor.channels), factor.state.numel(), factor.rows, self._sizes[0] * self._sizes[1])
+        self._values = np.zeros(self._sizes[1])
+        # Compiled functions work on a whole vector of records.
+        lanes = LANES if isinstance(backend, Compiled) else 1
+        self._buffers = channels, state, residual, jacobian = [np.zeros((count, lanes)) for count in counts]
+        self._evaluate: Callable[[], int] | None = None  # gives how many records did not settle
+        if isinstance(backend, Compiled) and kernel.points is None:
+            self._evaluate = backend.prepared(self._values, channels, state, residual, jacobian)
+
+    def linearise(self, values: Array, record: Array) -> tuple[Array, Array]:
+        """Residual (n_r) and its Jacobian by the kernel's values (n_r x n_v), in equilibrium."""
+        channels, state, residual, jacobian = self._buffers
+        self._values[:], channels[:], state[:] = values, record[:, None], 0.0
+        if self._evaluate is None or self._evaluate() or not np.abs(state).max(initial=0.0) <= MOST_DEFLECTION:
+            state[:] = 0.0
+            self._kernel.linearise(self._values, channels, state, residual, jacobian)
+        return residual[:, 0].copy(), jacobian[:, 0].reshape(self._sizes).copy()
+
+
+JointNoise = tuple[Array | None, ...]
+"""What noise of the joints' own readings adds to the covariance of each residual (n_r x n_r); None for nothing."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    factor: int  # which of the problem's measurements
+    record: Array  # its channels in the kernel's order (n_c)
+    group: int  # the place of its group; 0 without groups
+    noise: Array  # covariance of its own error (n_r x n_r)
+
+
+class Observer:
+    """Makes observations of records, for one problem.
+
+    ``noisy`` are drifts that count as noise: each record has its own. Of ``unfound`` groups records determine nothing.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        space: StateSpace,
+        gauss_markov: GaussMarkovStates,
+        noisy: GaussMarkovStates,
+        noise: Mapping[str, Array],
+        freedoms: Mapping[str, float],
+        defaults: Mapping[str, float],
+        unfound: Collection[str] = (),
+        joint_scale: float = 1.0,
+    ) -> None:
+        self.problem, self.space, self.gauss_markov = problem, space, gauss_markov
+        self._noise, self._defaults, self._unfound = noise, defaults, frozenset(unfound)
+        factors = [kernel.factor for kernel in problem.kernels]
+        self._freedoms = [freedoms[factor.name] for factor in factors]
+        self._ones = [OneRecord(kernel) for kernel in problem.kernels]
+        self._plain = [grouped.entries[0] if grouped.is_plain else None for grouped in problem.grouped]
+        self.shifts = [gauss_markov.shifts(factor.name, factor.rows) for factor in factors]
+        self.drifts, self.noisy_drifts = gauss_markov.drifts, noisy.drifts
+        self._noisy_joints = {
+            f"{arm.name}.{joint}": joint_scale * arm.joint_noise
+            for arm in problem.blueprint.arms.values()
+            for joint, dimension in arm.commanded.items()
+            if arm.joint_noise and dimension == "angle"
+        }
+        self.size = len(space.scales) + len(gauss_markov)
+
+    def readings(self, channels: Mapping[str, float], labels: Mapping[str, str]) -> tuple[Reading, ...]:
+        """What the measurements read of a record; empty if none applies, as when its group is not known."""
+        known = {**self._defaults, **{name: value for name, value in channels.items() if np.isfinite(value)}}
+        readings = []
+        for place, kernel in enumerate(self.problem.kernels):
+            factor = kernel.factor
+            if any(channel not in known for channel in factor.channels):
+                continue
+            group = self._group(factor.name, known, labels)
+            if group == NO_GROUP:
+                continue
+            noise = self._noise[factor.name]
+            stated = [next((c for c in own if c in known), None) for own in factor.noise_channels]
+            if any(stated):
+                ratio = np.array([known[c] / sd if c else 1.0 for c, sd in zip(stated, factor.noise, strict=True)])
+                noise = np.asarray(noise * np.outer(ratio, ratio))
+            readings.append(Reading(place, np.array([known[channel] for channel in factor.channels]), group, noise))
+        return tuple(readings)
+
+    def _group(self, instance: str, known: Mapping[str, float], labels: Mapping[str, str]) -> int:
+        """The number of a record's group; ``NO_GROUP`` for one that is not named or that the calibration lacks."""
+        blueprint = self.problem.blueprint
+        measurement = blueprint.measurements[instance]
+        if not isinstance(measurement, GroupedMeasurement):
+            return 0
+        alone = Dataset(("",), {n: np.array([v]) for n, v in known.items()}, {n: (v,) for n, v in labels.items()})
+        try:
+            numbers = group_numbers(alone, instance, measurement, blueprint.groups)
+        except DataError:
+            return NO_GROUP
+        number = NO_GROUP if numbers is None else int(numbers[0])
+        if number == NO_GROUP or not self._unfound:
+            return number
+        owner = owner_of(instance, measurement)
+        key = group_key(blueprint.measurements, blueprint.groups, instance, number)
+        names = {group_name(owner, key, block.name) for block in measurement.group_parameters(key)}
+        return NO_GROUP if names & self._unfound else number
+
+    def freedom(self, readings: Sequence[Reading]) -> float:
+        """Degrees of freedom with which the noise of a record is known: those of its least known reading."""
+        return min(self._freedoms[reading.factor] for reading in readings)
+
+    def joint_noise(self, values: Array, readings: tuple[Reading, ...]) -> JointNoise:
+        if not self._noisy_joints:
+            return (None,) * len(readings)
+        names, added = tuple(self._noisy_joints), []
+        for reading in readings:
+            kernel, own, record, state = self._repeated(values, reading)
+            rows = kernel.factor.rows
+            kernel.residuals(own, record, state, np.empty((rows, LANES)))
+            slopes = np.empty((rows * len(names), LANES))
+            kernel.channel_slopes(own, record, state, slopes, names)
+            carried = slopes[:, 0].reshape(rows, len(names)) * np.array(list(self._noisy_joints.values()))
+            added.append(np.asarray(carried @ carried.T))
+        return tuple(added)
+
+    def _repeated(self, values: Array, reading: Reading) -> tuple[Kernel, Array, Array, Array]:
+        kernel, grouped = self.problem.kernels[reading.factor], self.problem.grouped[reading.factor]
+        record = np.repeat(reading.record[:, None], LANES, axis=1)
+        return kernel, grouped.values(values, reading.group), record, np.zeros((kernel.factor.state.numel(), LANES))
+
+    def linearise(self, values: Array, reading: Reading) -> tuple[Array, Array]:
+        """Innovation (n_r) and the prediction's derivative by scaled coordinates (n_r x n), within the domains."""
+        factor = reading.factor
+        grouped, evaluator, entries = self.problem.grouped[factor], self._ones[factor], self._plain[factor]
+        if entries is not None:
+            innovation, jacobian = evaluator.linearise(values[entries], reading.record)
+        else:
+            innovation, own = evaluator.linearise(grouped.values(values, reading.group), reading.record)
+            jacobian = np.zeros((len(innovation), grouped.width))
+            moving = np.flatnonzero(grouped.free[reading.group] != HELD)
+            jacobian[:, grouped.free[reading.group][moving]] = own[:, moving]
+        return innovation, -self.space.by_coordinates(values, jacobian)
+
+    def observation(self, belief: Belief, readings: tuple[Reading, ...], noise: JointNoise = ()) -> RecordObservation:
+        return RecordObservation(self, belief.origin, belief.gaussian.mean, readings, noise)
+
+
+@dataclass(frozen=True)
+class RecordObservation(Observation):
+    """One record about an origin.
+
+    Attributes:
+        base: scaled coordinates (N) of the belief's mean, which may lie off the origin where that is at a bound: the
+            model is evaluated as far from the origin as a point is from the base, and continued in a straight line.
+    """
+
+    observer: Observer  # of the problem
+    origin: Array  # values within their domains, where the model is evaluated
+    base: Array
+    readings: tuple[Reading, ...]  # of the record
+    joint_noise: JointNoise = ()  # by reading
+    _last: dict[bytes, Linearised] = field(default_factory=dict, compare=False, repr=False)
+
+    @override
+    def at(self, point: Array) -> Linearised:
+        key = point.tobytes()
+        if key not in self._last:
+            self._last.clear()
+            self._last[key] = self._linearised(point)
+        return self._last[key]
+
+    def _linearised(self, point: Array) -> Linearised:
+        observer, space = self.observer, self.observer.space
+        n = len(space.scales)
+        which, coordinate, size = observer.drifts
+        moved, beside, outside = point[:n] - self.base[:n], point[n:], self.base[:n]
+        if len(which):
+            np.add.at(moved, coordinate, size * beside[which])
+        values = space.moved(self.origin, moved)
+        inside = space.inside(values)
+        if not (inside == values).all():
+            outside = outside + space.between(inside, values)
+        innovations, slopes, drifting = [], [], []
+        for reading in self.readings:
+            innovation, slope = observer.linearise(inside, reading)
+            innovation = innovation - slope @ outside
+            if len(observer.noisy_drifts[1]):
+                drifting.append(slope[:, observer.noisy_drifts[1]] * observer.noisy_drifts[2])
+            if len(beside):
+                shift = observer.shifts[reading.factor].copy()
+                innovation = innovation - shift @ beside
+                shift[:, which] = slope[:, coordinate] * size
+                slope = np.hstack([slope, shift])
+            innovations.append(innovation)
+            slopes.append(slope)
+        added = self.joint_noise or (None,) * len(self.readings)
+        noises = [r.noise if a is None else r.noise + a for r, a in zip(self.readings, added, strict=True)]
+        noise = noises[0] if len(noises) == 1 else block_diag(*noises)
+        if drifting:
+            drifted = np.vstack(drifting)
+            noise = noise + drifted @ drifted.T
+        return Linearised(np.concatenate(innovations), np.vstack(slopes), noise)

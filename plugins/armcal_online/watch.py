@@ -23,8 +23,7 @@ from armcal.base.config_text import as_line
 from armcal.cli.common import say
 from armcal.errors import ArmcalError, InputError, Location
 
-from armcal_online.running.situation import EARLIER, EVENTS, present
-from armcal_online.tracking.decisions import spoken_time
+from armcal_online.decisions import EARLIER, EVENTS, present, spoken_time
 
 DEFAULT_PORT = 8642
 _HOST = "127.0.0.1"
@@ -56,7 +55,6 @@ def watch(folder: Path, port: int, once: bool) -> None:
 
 
 def first_screen(now: Mapping[str, Any]) -> list[str]:
-    """The first screen as lines of text."""
     screen, life, level = now["situation"], now["life"], now.get("level", "unknown")
     gone = {"killed": "not running", "stopped": "not running", "hangs": "not answering"}.get(life)
     size, before, of = _mm(screen.get("off_mm")), _mm(screen.get("off_before_mm")), screen.get("off_of")
@@ -120,7 +118,7 @@ def newest_events(folder: Path) -> dict[str, list[dict[str, Any]]]:
 @lru_cache
 def page() -> tuple[bytes, str]:
     """The page, and the policy that lets no script and style in but its own."""
-    html = resources.files("armcal_online.commands").joinpath("watch.html").read_text(encoding="utf-8")
+    html = resources.files("armcal_online").joinpath("watch.html").read_text(encoding="utf-8")
     (style,), (script,) = (re.findall(f"<{tag}>(.*?)</{tag}>", html, re.DOTALL) for tag in ("style", "script"))
     own = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
     policy = f"default-src 'none'; style-src 'sha256-{own[0]}'; script-src 'sha256-{own[1]}'; connect-src 'self'; "
@@ -128,11 +126,7 @@ def page() -> tuple[bytes, str]:
 
 
 class WatchServer(ThreadingHTTPServer):
-    """Serves a folder's state to this machine; from elsewhere SSH leads there.
-
-    Raises:
-        InputError: the port cannot be listened on.
-    """
+    """Serves a folder's state to this machine; from elsewhere SSH leads there."""
 
     daemon_threads, block_on_close = True, False
 
@@ -152,11 +146,7 @@ class WatchServer(ThreadingHTTPServer):
         return f"http://{_HOST}:{self.server_address[1]}/"
 
     def allows(self, host_header: str | None) -> bool:
-        """Judge a request by its Host header, which must name this machine.
-
-        A page of another site, whose name was made to point here, is refused. The port may be any, since a tunnel may
-        begin at another one.
-        """
+        """A page of another site, whose name was made to point here, is refused; a tunnel may begin at any port."""
         named = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[]+))(?::[0-9]*)?", (host_header or "").strip().lower())
         return named is not None and (named[1] or named[2]) in ("localhost", _HOST, "::1")
 
@@ -169,7 +159,6 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version, timeout = "armcal", "", _PATIENCE_S
 
     def do_GET(self) -> None:
-        """The page, or the state."""
         address = urlsplit(self.path)
         if not self.server.allows(self.headers.get("Host")):
             self._answer(HTTPStatus.FORBIDDEN, b"Forbidden: wrong name in the address.\n")

@@ -36,9 +36,8 @@ from armcal.errors import ArmcalError
 from armcal.estimate.online import Gaussian, Linearised
 from armcal.problem.problem import Problem
 
-from armcal_online.tracking.belief import Belief, ProcessNoise, StateSpace
-from armcal_online.tracking.observer import JointNoise, Observer, Reading
-from armcal_online.tracking.settings import ChangeSettings
+from armcal_online.belief import Belief, JointNoise, Observer, ProcessNoise, Reading, StateSpace
+from armcal_online.settings import ChangeSettings
 
 CauseKind = Literal["payload_changed", "gravity_tilted", "link_bent"]
 CAUSES: tuple[CauseKind, ...] = get_args(CauseKind)
@@ -48,11 +47,9 @@ PAYLOAD, GRAVITY, LINK = "payload", "gravity", "link "
 
 @dataclass(frozen=True)
 class Cause:
-    """A change at once: its kind, what it is of, and the scaled coordinates that it changes."""
-
     kind: CauseKind
     subject: str
-    coordinates: tuple[int, ...]
+    coordinates: tuple[int, ...]  # scaled ones, that it changes
 
 
 def spoken(subject: str) -> str:
@@ -101,35 +98,21 @@ _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class JointStep:
-    """A step of one joint.
-
-    Attributes:
-        local: coordinates that act along this joint's motion alone, the offset left out: what a new servo changes.
-    """
-
     joint: str  # its channel, ``arm.q3``
     dimension: str  # ``angle`` or ``length``
     direction: Array  # in scaled coordinates, of a step of 1 rad or m (n)
-    local: tuple[int, ...]
+    local: tuple[int, ...]  # coordinates that act along its motion alone, but its offset: what a new servo changes
     parameter: str  # the one that is the joint's offset; empty if it takes several
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps that the filter can follow.
-
-    Attributes:
-        sensors: by measurement, scaled coordinates of shifts (m) and turns (rad) of its frame (n x up to 6), and
-            which of ``x y z rx ry rz`` they are.
-    """
-
     joints: tuple[JointStep, ...]  # those that parameters can make
     unfollowed: tuple[str, ...]  # joints whose steps no combination of parameters makes
-    sensors: Mapping[str, tuple[Array, tuple[str, ...]]]
+    sensors: Mapping[str, tuple[Array, tuple[str, ...]]]  # of frames: coordinates of shifts (m), turns (rad), and which
     causes: tuple[Cause, ...] = ()  # what else may change at once
 
     def dimension(self, joint: str) -> str:
-        """Of a joint's step: ``angle`` or ``length``; empty for what is no joint."""
         return next((step.dimension for step in self.joints if step.joint == joint), "")
 
 
@@ -273,22 +256,17 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A change: its kind, joint or measurement, what it reopens (N x k; a column a standard deviation), its prior.
-
-    ``scale`` is 1 for one of the stated size, less for a small one; ``step`` (n) is a step of 1 rad, m or kg; ``parts``
-    are those of which it is made, if they are two. What a gradual one reopens it gains in a day; ``rates`` (k) are the
-    standard deviations of that (rad or m).
-    """
+    """A change."""
 
     kind: Kind
-    subject: str
-    directions: Array
+    subject: str  # joint or measurement
+    directions: Array  # what it reopens (N x k; a column a standard deviation); a gradual one gains it in a day
     factor: float
     log_prior: float
-    step: Array
-    scale: float = 1.0
-    parts: tuple[Hypothesis, ...] = ()
-    rates: tuple[float, ...] = ()
+    step: Array  # of 1 rad, m or kg (n)
+    scale: float = 1.0  # 1 for one of the stated size, less for a small one
+    parts: tuple[Hypothesis, ...] = ()  # of which it is made, if they are two
+    rates: tuple[float, ...] = ()  # standard deviations of what a gradual one gains in a day (k; rad or m)
 
     @property
     def singles(self) -> tuple[Hypothesis, ...]:
@@ -301,8 +279,6 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Recent:
-    """A record that was judged not long ago."""
-
     sequence: int  # its number
     readings: tuple[Reading, ...]  # by the measurements
     joint_noise: JointNoise  # by reading
@@ -315,8 +291,6 @@ class Recent:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A hypothesis from its likeliest onset (a place among the last records)."""
-
     hypothesis: Hypothesis  # the change
     onset: int  # the first record after the change
     log_odds: float  # of it against no change, its prior probability included
@@ -328,10 +302,8 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A hypothesis (its place among all) that is followed record by record: its evidence so far, and its belief."""
-
-    place: int
-    log_evidence: float
+    place: int  # among all hypotheses, of one that is followed record by record
+    log_evidence: float  # so far
     belief: Belief
 
 
@@ -405,20 +377,14 @@ _ENOUGH = 0.9
 
 
 def is_enough(single: Explanation, large: int) -> bool:
-    """Whether one change explains all records since that do not fit, and most of their misfit.
-
-    A change of everything is not enough: it would explain two changes as well.
-    """
+    """A change of everything is not enough: it would explain two changes as well."""
     if single.hypothesis.kind == "general_change":
         return False
     return single.large >= large and single.share >= _ENOUGH
 
 
 def pairs(singles: Sequence[Explanation], changes: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Steps of joints and motions of instruments of the stated size, two by two, as a blow makes both at once.
-
-    Of all single ``changes`` those of the likeliest joints and instruments, which are the first of ``singles``.
-    """
+    """Two by two, as a blow makes both at once; of the likeliest joints and instruments, the first of ``singles``."""
     subjects = list(dict.fromkeys(single.hypothesis.subject for single in singles))
     kinds = ("joint_slipped", "sensor_moved")
     of = {change.subject: change for change in changes if change.kind in kinds and change.scale == 1.0}
@@ -451,14 +417,9 @@ class SlowEvidence:
 
 @dataclass(frozen=True)
 class SlowState:
-    """Evidence from two beginnings, the older first, and the trends that were found.
-
-    ``trend`` is how far the parameters move in a second, ``wander`` the variance that they gain in one (n; scaled).
-    """
-
-    tracks: tuple[SlowEvidence, ...] = ()
-    trend: Array | None = None
-    wander: Array | None = None
+    tracks: tuple[SlowEvidence, ...] = ()  # evidence from two beginnings, the older first
+    trend: Array | None = None  # how far the parameters move in a second, as was found (n; scaled)
+    wander: Array | None = None  # the variance that they gain in one
 
 
 _LONGEST = 200  # records of a track; at half of them the next begins
@@ -470,24 +431,16 @@ _WANDERS = 0.25  # a trend may become as much faster or slower in the time that 
 
 @dataclass(frozen=True)
 class Weighing:
-    """A slow change: weighed by a track, its size (k; standard deviations) and the covariance of that (k x k)."""
-
     change: Hypothesis
     track: SlowEvidence
-    columns: slice
+    columns: slice  # of the change in the track
     log_odds: float
-    size: Array
-    covariance: Array
+    size: Array  # k; standard deviations
+    covariance: Array  # of the size (k x k)
 
 
 class SlowChanges:
-    """Evidence for some changes; it keeps no state.
-
-    Args:
-        changes: whose directions are reopened at once, or, of the kinds that are gradual, gained in a day.
-        process_noise: of the beliefs.
-        probability: of any change before one record.
-    """
+    """Evidence for some changes; it keeps no state."""
 
     def __init__(self, changes: Sequence[Hypothesis], process_noise: ProcessNoise, probability: float) -> None:
         self._changes, self._process_noise, self._probability = changes, process_noise, probability
@@ -499,7 +452,6 @@ class SlowChanges:
         self._in_a_second = whole * is_gradual / _DAY_S
 
     def passed(self, state: SlowState, passed: Mapping[str, float]) -> SlowState:
-        """After some distance in each channel: gradual changes have gone on."""
         n, seconds = len(self._process_noise.rates), max(passed.get("time", 0.0), 0.0)
         kept = np.ones(len(self._at_once))
         kept[n:] = self._process_noise.gauss_markov.kept(passed)
@@ -578,11 +530,9 @@ class SlowChanges:
         return least
 
     def is_due(self, weighing: Weighing) -> bool:
-        """Whether the track of a change ends, so that it is to be decided now."""
         return weighing.track.records >= _LONGEST - 1
 
     def followed(self, state: SlowState, weighing: Weighing, belief: Belief) -> tuple[SlowState, Belief]:
-        """The belief with a change in it; where that is gradual, it goes on from now on."""
         effect = weighing.track.effect[:, weighing.columns]
         gaussian, n = belief.gaussian, len(self._process_noise.rates)
         covariance = gaussian.covariance + effect @ weighing.covariance @ effect.T

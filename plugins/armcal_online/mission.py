@@ -36,12 +36,12 @@ from armcal.run.result import calibration_content
 from pydantic import Field, model_validator
 from typing_extensions import override
 
-from armcal_online.mission.simulator import DAY_S, HOUR_S, Event, Mission, MissionOfDays, with_payload
-from armcal_online.running.session import Setup, opened
+from armcal_online.commands import header_of, opened
+from armcal_online.mission_simulator import DAY_S, HOUR_S, Event, Mission, MissionOfDays, with_payload
+from armcal_online.recalibrator import Recalibrator
+from armcal_online.settings import SECTION as RECALIBRATE
+from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming, Lines, RowParser
-from armcal_online.tracking.recalibrator import Recalibrator
-from armcal_online.tracking.settings import SECTION as RECALIBRATE
-from armcal_online.tracking.settings import RecalibrateSettings
 
 SECTION = "mission"
 BENCH, CALIBRATION, RECORDS, RECALIBRATION = "bench.csv", "calibration.yaml", "records.csv", "recalibration"
@@ -69,8 +69,6 @@ class MissionRunSettings(Settings):
 
 @dataclass(frozen=True)
 class MissionPlan:
-    """A mission's configuration, checked and built, before anything is simulated."""
-
     experiment: Experiment
     simulator: MissionOfDays
     settings: MissionRunSettings
@@ -138,8 +136,6 @@ class CutSource(Lines):
 
 @dataclass
 class MissionLog:
-    """What a recalibration reported of each record, and what it estimated and decided when (s since the beginning)."""
-
     verdicts: dict[str, str] = field(default_factory=dict)
     estimates: dict[float, Mapping[str, float]] = field(default_factory=dict)
     levels: list[tuple[float, str]] = field(default_factory=list)
@@ -172,8 +168,9 @@ def recalibrated(plan: MissionPlan, mission: Mission, calibration: Path, folder:
     for cut in (*np.searchsorted(mission.times, mission.power_cuts).tolist(), np.inf):
         session = Recalibrator(Calibration.load(calibration, registry), every, registry)
         source = CutSource(folder / RECORDS, RowParser(session.request, settings.columns), cut)
-        setup = Setup(folder / RECALIBRATION, calibration, StandardOutput(stream))
-        with suppress(PowerCutError), opened(setup, session, source) as loop:
+        kept = folder / RECALIBRATION
+        going = opened(kept, header_of(kept, calibration, session), session, source, StandardOutput(stream))
+        with suppress(PowerCutError), going as loop:
             loop.run()
             if not source.ended:
                 raise KeyboardInterrupt
@@ -199,7 +196,7 @@ def error_curve(
 ) -> ErrorCurve:
     """Mean distance between a calibration's tip and the true one, as the camera sees it, in fixed random poses.
 
-    Nominal values of ``launch`` are those of the calibration before launch. A study adds ``references`` by name.
+    A study adds ``references`` by name.
     """
     truth, system = mission.truth, plan.experiment.system
     if truth.parameters.entry_names != launch.entry_names:
@@ -256,7 +253,6 @@ def _errors(problem: Problem, series: Series, times: Array, seen: Array) -> Arra
 
 
 def figures(plan: MissionPlan, mission: Mission, log: MissionLog, curve: ErrorCurve) -> dict[str, Any]:
-    """Everything that terminal, figure and other programs show."""
     limit, hour = plan.settings.limit, curve.is_hour
     usable = np.array([level in _USABLE for level in curve.levels]) & (curve.errors["recalibrated"] <= limit)
     verdicts = np.array([log.verdicts.get(text, "ignored") for text in mission.records.ids])
@@ -292,7 +288,6 @@ def _summary(mm: Array) -> dict[str, float]:
 
 
 def _event(event: Event, end: float, log: MissionLog, curve: ErrorCurve) -> dict[str, Any]:
-    """The first decision after an event, and what became of the error until the next one (s since the beginning)."""
     begun, error = event.day * DAY_S, curve.errors["recalibrated"]
     day_before = (curve.times < begun) & (curve.times >= begun - DAY_S)
     before = float(np.median(error[day_before if day_before.any() else slice(1)]))
@@ -400,7 +395,6 @@ def _lines(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def mission_figure(curve: ErrorCurve, content: Mapping[str, Any]) -> bytes:
-    """A PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator

@@ -8,9 +8,9 @@ import numpy as np
 from armcal.estimate.online import Linearised
 from scipy.special import logsumexp
 
-from armcal_online.tracking.belief import Belief, StateSpace
-from armcal_online.tracking.decisions import EXPLAINED, Decision, log_odds_of, per_cent
-from armcal_online.tracking.hypotheses import (
+from armcal_online.belief import Belief, StateSpace
+from armcal_online.decisions import EXPLAINED, Decision, log_odds_of, per_cent
+from armcal_online.hypotheses import (
     CAUSES,
     GRADUAL,
     LEAST_RECORDS,
@@ -22,13 +22,12 @@ from armcal_online.tracking.hypotheses import (
     pairs,
     spoken,
 )
-from armcal_online.tracking.settings import ChangeSettings, RecalibrateSettings
-from armcal_online.tracking.state import Health, State, improbability, many_outliers, nis_limit
-from armcal_online.tracking.window_evidence import HypothesisFilter, Size, rate_of, size_of
+from armcal_online.settings import ChangeSettings, RecalibrateSettings
+from armcal_online.state import Health, State, improbability, many_outliers, nis_limit
+from armcal_online.window_evidence import HypothesisFilter, Size, rate_of, size_of
 
 
-def change_decision(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:
-    """A change that is followed from now on."""
+def _change_decision(state: State, alike: Sequence[Explanation], others: Sequence[Explanation], size: Size) -> Decision:
     best = alike[0]
     hypothesis, kind, subject = best.hypothesis, best.hypothesis.kind, best.hypothesis.subject
     since = state.recent[best.onset :]
@@ -56,14 +55,14 @@ def change_decision(state: State, alike: Sequence[Explanation], others: Sequence
     return Decision(kind, what, why, log_odds, onset, subject, names, size)
 
 
-def together_decisions(
+def _together_decisions(
     state: State,
     steps: Steps,
     alike: Sequence[Explanation],
     others: Sequence[Explanation],
     sizes: Sequence[Size],
 ) -> tuple[Decision, ...]:
-    """Two changes at once that are followed from now on: a decision each, or one where several pairs are as likely."""
+    """A decision for each of two changes at once, or one where several pairs are as likely."""
     best, since = alike[0], state.recent[alike[0].onset :]
     log_odds, onset = _against(alike, others), since[0].sequence
     why = (
@@ -84,64 +83,16 @@ def together_decisions(
     return tuple(decisions)
 
 
-def slow_decision(
-    change: Hypothesis, size: Size, since: int, records: int, log_odds: float, next_likeliest: str
-) -> Decision:
-    why = f"no single one of the {records} records since shows it, but all of them together do"
-    why += f"; the next likeliest is {spoken(next_likeliest)}" if next_likeliest else ""
-    return Decision(change.kind, _happened(change, size), why, log_odds, since, change.subject, (change.subject,), size)
-
-
-def unnamed_decision(candidates: Sequence[str], since: int, records: int, log_odds: float, factor: float) -> Decision:
-    """Something moves slowly, and the records do not distinguish what."""
-    what = f"Something moves more than stated: {_or(candidates)}"
-    why = (
-        f"no single one of the {records} records since shows it, but all of them together do, and they fit these about "
-        f"equally; all standard deviations are made {factor:g} times larger"
-    )
-    return Decision("drift", what, why, log_odds, since, "", tuple(candidates))
-
-
-def named_decision(state: State, change: Hypothesis, others: Sequence[str], margin: float, size: Size) -> Decision:
-    """Which of several it was; without others, that a joint which stepped acts like a new servo."""
-    about = (margin, state.suspected, change.subject, (change.subject,), size)
-    if others and change.kind.startswith("joint"):
-        why = f"the records since do not fit a change of {_or(others)} as well, which is as before"
-        return Decision("joint_named", f"It was joint {change.subject} that stepped, by {size.shown}", why, *about)
-    better = f"a change of {_or(others)}, which is as before" if others else "a slip alone"
-    return Decision(change.kind, _happened(change, size), f"the records since fit this better than {better}", *about)
-
-
-def drift_decision(state: State, count: int, ratio: float, by_chance: float, factor: float) -> Decision:
-    what = f"The last {count} records miss by more than stated, although no single one does by much"
-    why = (
-        f"their mean normalised innovation squared is {ratio:.1f} times what chance makes it; parameters move faster "
-        f"than stated, or the instrument is worse; all standard deviations are made {factor:.1f} times larger"
-    )
-    return Decision("drift", what, why, log_odds_of(by_chance), first_of(state, count))
-
-
-def unexplained_decision(state: State, rejected: int, by_chance: float, best: Explanation) -> Decision:
-    """Records do not fit, and nothing is decided yet."""
-    what = f"{rejected} of the last {len(state.recent)} records do not fit, and no change explains them yet"
-    why = (
-        f"outliers alone are rarely so many; the likeliest change is {_named(best.hypothesis)} "
-        f"({per_cent(best.log_odds):.0f} %)"
-    )
-    return Decision("unexplained", what, why, log_odds_of(by_chance), _first_rejected(state))
-
-
-def unfit_decision(state: State, steps: Steps, why: str, log_odds: float, since: int | None = None) -> Decision:
+def _unfit_decision(state: State, steps: Steps, why: str, log_odds: float, since: int | None = None) -> Decision:
     unfollowed = f"; steps of {', '.join(steps.unfollowed)} cannot be followed" if steps.unfollowed else ""
     first = _first_rejected(state) if since is None else since
     return Decision("model_no_longer_fits", "The model no longer fits the records", why + unfollowed, log_odds, first)
 
 
 def beside_model_error(decision: Decision, far: float, log_likelihood: float, settings: ChangeSettings) -> Decision:
-    """A decision whose odds are over the model's own error too, which is named beside it where it may be that.
+    """Its odds are over the model's own error too, which is named beside it where it may be that.
 
-    How ``far`` the change moves the readings and the log likelihood of that are of ``sizes.in_model_errors``. The
-    model's own error needs no event to be there; a change is as rare as ``settings`` have it.
+    ``far`` and ``log_likelihood`` are of ``in_model_errors``. That error needs no event to be there; a change is rare.
     """
     log_odds = log_likelihood - math.log(settings.probability)
     if log_odds < -math.log(settings.naming_odds):
@@ -162,7 +113,7 @@ def _first_rejected(state: State) -> int:
     return next((record.sequence for record in state.recent if record.rejected), state.sequence)
 
 
-def first_of(state: State, count: int) -> int:
+def _first_of(state: State, count: int) -> int:
     return state.ids[-min(count, len(state.ids))].sequence if state.ids else state.sequence
 
 
@@ -177,7 +128,6 @@ def _named(hypothesis: Hypothesis) -> str:
 
 
 def _happened(change: Hypothesis, size: Size) -> str:
-    """What happened, as a clause."""
     subject = spoken(change.subject)
     clauses = {
         "joint_slipped": f"Joint {subject} slipped by {size.shown}",
@@ -211,8 +161,6 @@ _TOO_MANY = 1e-3  # more outliers than chance makes with this probability are a 
 
 
 class Judge:
-    """Judges the last records of a recalibration."""
-
     def __init__(
         self,
         space: StateSpace,
@@ -226,7 +174,6 @@ class Judge:
         self._changes, self._settings = changes, settings
 
     def after(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """What is decided after a record, the last of ``state.recent``; the state follows it."""
         state, naming = self._name_suspect(state)
         state, change = self._detect_change(state)
         if not change and state.recent and not state.recent[-1].rejected:
@@ -237,7 +184,7 @@ class Judge:
         return (replace(state, slow=replace(state.slow, tracks=())) if decisions else state), decisions
 
     def health(self, state: State, decisions: Sequence[Decision], first: Linearised) -> Health:
-        """Health after a record, the last of ``state.recent`` before the decisions; ``first`` is at its prior mean."""
+        """After a record, the last of ``state.recent`` before the decisions; ``first`` is at its prior mean."""
         health, settings, recent = state.health, self._settings, state.recent[-1]
         for decision in decisions:
             if decision.kind in EXPLAINED and health.level != "lost":
@@ -266,7 +213,6 @@ class Judge:
         return health.calmed(settings.levels.calm)
 
     def _detect_change(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """Whether the last records indicate a change."""
         large = [
             i
             for i, record in enumerate(state.recent)
@@ -294,10 +240,15 @@ class Judge:
         by_chance = many_outliers(rejected, gate.window, self._outliers(state))
         if rejected >= gate.window - 1 and len(state.recent) >= gate.window:
             text = f"{rejected} of the last {len(state.recent)} records do not fit"
-            return state, (unfit_decision(state, self._steps, text, log_odds_of(by_chance)),)
+            return state, (_unfit_decision(state, self._steps, text, log_odds_of(by_chance)),)
         if rejected < gate.rejected or by_chance >= settings.probability:
             return state, ()
-        return state, (unexplained_decision(state, rejected, by_chance, best),)
+        what = f"{rejected} of the last {len(state.recent)} records do not fit, and no change explains them yet"
+        why = (
+            f"outliers alone are rarely so many; the likeliest change is {_named(best.hypothesis)} "
+            f"({per_cent(best.log_odds):.0f} %)"
+        )
+        return state, (Decision("unexplained", what, why, log_odds_of(by_chance), _first_rejected(state)),)
 
     def _outliers(self, state: State) -> float:
         """The share of wrong records: as stated, or more where records before the last ones had more."""
@@ -355,7 +306,6 @@ class Judge:
     def _follow_change(
         self, state: State, alike: Sequence[Explanation], others: Sequence[Explanation]
     ) -> tuple[State, tuple[Decision, ...]]:
-        """The state with what a change reopens, from before it on."""
         best, since = alike[0], state.recent[alike[0].onset :]
         reopened = {id(change): change for explanation in alike for change in explanation.hypothesis.singles}
         directions = np.hstack([change.directions for change in reopened.values()])
@@ -368,10 +318,11 @@ class Judge:
             if change.subject in subjects and change.subject and change.scale == 1.0
         )
         suspects = suspects if len(suspects) > 1 else ()
-        after = state.following(
-            belief,
+        after = replace(
+            state,
+            belief=belief,
             recent=(),
-            nis_window=(),
+            nis=(),
             drifted=0,
             wary=False,
             suspects=suspects,
@@ -380,15 +331,15 @@ class Judge:
         )
         sizes = [self._size(since[0].before, belief, change) for change in best.hypothesis.singles]
         if best.hypothesis.parts:
-            return after, together_decisions(state, self._steps, alike, others, sizes)
-        decision = change_decision(state, alike, others, sizes[0])
+            return after, _together_decisions(state, self._steps, alike, others, sizes)
+        decision = _change_decision(state, alike, others, sizes[0])
         if best.hypothesis.kind == "general_change":
             late = tuple(s for s in state.changes if state.sequence - s < 10 * self._settings.gate.window)
             after = replace(after, changes=(*late, state.sequence)[-_UNEXPLAINED:])
             if len(after.changes) >= _UNEXPLAINED:
                 text = f"{len(after.changes)} changes that nothing explains came within a short time"
                 first = after.changes[0]
-                return after, (unfit_decision(state, self._steps, text, decision.log_odds, first),)
+                return after, (_unfit_decision(state, self._steps, text, decision.log_odds, first),)
         return after, (decision,)
 
     def _name_suspect(self, state: State) -> tuple[State, tuple[Decision, ...]]:
@@ -410,36 +361,47 @@ class Judge:
         if not others and change.kind != "joint_replaced":
             return settled, ()
         left = tuple(candidate for candidate in followed if candidate not in others) if others else ()
-        after = settled.following(best.belief, recent=(), wary=False)
+        after = replace(settled, belief=best.belief, recent=(), wary=False)
         if len(left) > 1:
             after = replace(after, suspects=left, before_change=state.before_change)
         size = self._size(state.before_change or best.belief, best.belief, change)
-        names = tuple(dict.fromkeys(self._changes[other.place].subject for other in others))
-        return after, (named_decision(state, change, names, margin, size),)
+        about = (margin, state.suspected, change.subject, (change.subject,), size)
+        names = _or(list(dict.fromkeys(self._changes[other.place].subject for other in others)))
+        if others and change.kind.startswith("joint"):
+            why = f"the records since do not fit a change of {names} as well, which is as before"
+            what = f"It was joint {change.subject} that stepped, by {size.shown}"
+            return after, (Decision("joint_named", what, why, *about),)
+        better = f"a change of {names}, which is as before" if others else "a slip alone"
+        why = f"the records since fit this better than {better}"
+        return after, (Decision(change.kind, _happened(change, size), why, *about),)
 
     def _detect_drift(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """Whether the NIS as a whole is too large, though no record's is."""
         settings = self._settings.levels
-        if len(state.nis_window) < settings.window:
+        if len(state.nis) < settings.window:
             return state, ()
         known = min(map(self._filter.freedom, state.recent), default=math.inf)
-        by_chance = improbability(state.nis_window, known)
+        by_chance = improbability(state.nis, known)
         if by_chance >= settings.probability:
-            return replace(state, drifted=0, nis_window=state.nis_window[settings.window // 2 :]), ()
-        total, freedom = (float(sum(column)) for column in zip(*state.nis_window, strict=True))
-        ratio, count = total / freedom, len(state.nis_window)
-        state = replace(state, nis_window=(), drifted=state.drifted + 1)
+            return replace(state, drifted=0, nis=state.nis[settings.window // 2 :]), ()
+        total, freedom = (float(sum(column)) for column in zip(*state.nis, strict=True))
+        ratio, count = total / freedom, len(state.nis)
+        state = replace(state, nis=(), drifted=state.drifted + 1)
         if state.drifted >= _UNEXPLAINED:
             text = f"the NIS of {count} records is {ratio:.1f} times what chance makes it, again and again"
-            since = first_of(state, _UNEXPLAINED * count)
-            return state, (unfit_decision(state, self._steps, text, log_odds_of(by_chance), since),)
+            since = _first_of(state, _UNEXPLAINED * count)
+            return state, (_unfit_decision(state, self._steps, text, log_odds_of(by_chance), since),)
         factor = min(math.sqrt(ratio), _MOST_WIDENING)
         belief = state.belief.widened(len(self._space.scales), factor)
-        decision = drift_decision(state, count, ratio, by_chance, factor)
-        return state.following(belief), (decision,)
+        what = f"The last {count} records miss by more than stated, although no single one does by much"
+        why = (
+            f"their mean normalised innovation squared is {ratio:.1f} times what chance makes it; parameters move "
+            "faster than stated, or the instrument is worse; "
+            f"all standard deviations are made {factor:.1f} times larger"
+        )
+        decision = Decision("drift", what, why, log_odds_of(by_chance), _first_of(state, count))
+        return replace(state, belief=belief), (decision,)
 
     def _detect_slow(self, state: State) -> tuple[State, tuple[Decision, ...]]:
-        """Whether many records together speak for a change that none of them shows."""
         weighings, settings = self._slow.weighed(state.slow), self._settings.changes
         if not weighings or state.suspects or weighings[0].log_odds <= math.log(settings.odds):
             return state, ()
@@ -447,13 +409,17 @@ class Judge:
         near = [one for one in weighings if best.log_odds - one.log_odds < odds]
         others = [one.log_odds for one in weighings if one not in near]
         log_odds = float(logsumexp([one.log_odds for one in near]) - logsumexp([0.0, *others]))
-        about = (best.track.since, best.track.records, log_odds)
+        why = f"no single one of the {best.track.records} records since shows it, but all of them together do"
+        since = best.track.since
         if len(near) > 1 and not self._slow.is_due(best):
             return state, ()
         if len(near) > 1:
             belief = state.belief.widened(len(self._space.scales), _UNNAMED)
-            decision = unnamed_decision([one.change.subject for one in near], *about, _UNNAMED)
-            return state.following(belief), (decision,)
+            candidates = tuple(one.change.subject for one in near)
+            what = f"Something moves more than stated: {_or(candidates)}"
+            why += f", and they fit these about equally; all standard deviations are made {_UNNAMED:g} times larger"
+            decision = Decision("drift", what, why, log_odds, since, "", candidates)
+            return replace(state, belief=belief), (decision,)
         slow, belief = self._slow.followed(state.slow, best, state.belief)
         is_gradual = best.change.kind in GRADUAL
         size = (
@@ -461,8 +427,12 @@ class Judge:
             if is_gradual
             else self._size(state.belief, belief, best.change)
         )
-        decision = slow_decision(best.change, size, *about, weighings[1].change.subject if len(weighings) > 1 else "")
-        return state.following(belief, recent=(), nis_window=(), slow=slow), (decision,)
+        why += f"; the next likeliest is {spoken(weighings[1].change.subject)}" if len(weighings) > 1 else ""
+        subject = best.change.subject
+        decision = Decision(
+            best.change.kind, _happened(best.change, size), why, log_odds, since, subject, (subject,), size
+        )
+        return replace(state, belief=belief, recent=(), nis=(), slow=slow), (decision,)
 
     def _size(self, before: Belief, after: Belief, change: Hypothesis) -> Size:
         return size_of(self._space, self._steps, before, after, change)

@@ -1,1 +1,0 @@
-"""A simulated mission, judged against its truth."""

@@ -1,1 +1,0 @@
-"""A recalibration that runs: its loop, its outputs, and its control socket."""

@@ -1,1 +1,0 @@
-"""What is believed of an arm while it works, record by record, and how records are judged."""
