@@ -20,7 +20,7 @@ from armcal.config.servo_file import ServoFile
 from armcal.config.yaml_source import load_config
 from armcal.devices.live import TrackerFrame
 from armcal.errors import ConfigError, NotConvergedError
-from armcal.functions.interpreted import BoundFunction
+from armcal.functions.batch_function import BoundFunction
 from armcal.run.experiment import Experiment
 from pydantic import Field
 
