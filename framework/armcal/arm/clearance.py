@@ -127,7 +127,6 @@ class Clearance(Settings):
     forbidden: tuple[Annotated[Box | Ball, Field(discriminator="type")], ...] = ()
 
     def pairs(self, rule: Rule, moved_by: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
-        """The pairs of parts that a rule is about; ``moved_by`` gives each frame's joint (0: none)."""
         kept = [name for name in self.parts if not any(fnmatchcase(name, other) for other in rule.besides)]
         joints = {name: [moved_by[frame] for shape in self.parts[name] for frame in shape.frames] for name in kept}
         firsts, seconds = (
@@ -140,18 +139,13 @@ class Clearance(Settings):
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found.
+    """How much farther apart parts are than asked."""
 
-    Attributes:
-        margins: how much farther apart than asked, the worst pair of each rule and then the forbidden regions
-            (rules + 1 x N, m; infinite where there is nothing to check).
-    """
-
+    # Of the worst pair of each rule, then of the forbidden regions (rules + 1 x N, m; infinite without any)
     margins: Array
 
     @property
     def allowed(self) -> Mask:
-        """Poses in which nothing is too near (N)."""
         return np.asarray(np.all(self.margins >= 0, axis=0))
 
 
@@ -160,8 +154,6 @@ def joints_of_frames(arm: Arm) -> dict[str, int]:
 
 
 class ClearanceCheck:
-    """A clearance, compiled for an arm."""
-
     def __init__(self, arm: Arm, clearance: Clearance) -> None:
         self._clearance = clearance
         moved_by = joints_of_frames(arm)
@@ -222,14 +214,10 @@ class ClearanceCheck:
 
 
 def distance(first: Shape, second: Shape, where: Mapping[Point, Array]) -> Array:
-    """The distance of two shapes in every pose (N, m), given their points in the base frame (N x 3).
-
-    One of them must be a capsule.
-    """
+    """The distance of two shapes, one a capsule, in every pose (N, m), given their points in the base (N x 3)."""
     if not isinstance(first, _ROUND):
         first, second = second, first
-    if not isinstance(first, _ROUND):
-        raise ValueError("two fixed bodies need no check")
+    assert isinstance(first, _ROUND), "two fixed bodies need no check"
     start, end = (where[p] if p in where else np.array([p.at]) for p in (first.start, first.end))
     if isinstance(second, _ROUND):
         others = (where[p] if p in where else np.array([p.at]) for p in (second.start, second.end))
@@ -282,7 +270,6 @@ def _outside(points: Array, low: Array, high: Array) -> Array:
 
 
 def _point_function(arm: Arm, points: Sequence[Point]) -> ca.Function:
-    """Joint commands to the points in the base frame, stacked."""
     chain = arm.nominal_chain
     commands = ca.SX.sym("commands", len(arm.commanded))
     commanded = arm.joint_commands(ca.vertsplit(commands))
