@@ -1,4 +1,4 @@
-"""Boards in images: found on a reduced image, refined on the full one.
+"""Boards in images: grey values of image files; boards found on a reduced image, refined on the full one.
 
 OpenCV says about where the corners are, ``armcal_camera.detection`` where exactly; so the corners hardly depend on its
 version. A chessboard must be seen whole, as nothing else says which of its corners is which; of boards with tags a
@@ -15,14 +15,67 @@ it is more accurate than a point's gradient, and its width says how sharp the im
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from io import BytesIO
 from typing import Any, NamedTuple
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from armcal.base.arrays import Array
+from armcal.errors import DataError, Location
+from armcal.plugins import library
+from numpy.typing import NDArray
 from scipy.special import erf
 
-from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard, dictionary
-from armcal_camera.images import Grey, opencv
+from armcal_camera.board import FAMILIES, Board, Charuco, Chessboard, dictionary, opencv
+
+Grey = NDArray[np.uint8]  # An image (H x W); the centre of the pixel in column u and row v is at (u, v)
+
+_ENDS = ((b"\x89PNG", b"IEND", 64), (b"\xff\xd8", b"\xff\xd9", 4096))
+_KINDS = ("PNG", "JPEG", "TIFF", "BMP", "DIB", "WEBP", "PPM")
+_FEWEST_PIXELS, MOST_PIXELS = 1024, 100_000_000
+MOST_BYTES = 512 * 1024**2  # Of an image file
+
+
+def grey_image(content: bytes, source: str) -> Grey:
+    """The grey values of an image file, as the sensor has them: an orientation that it states is not applied.
+
+    Of more than 8 bits a pixel the brightest hundredth of the image becomes 255, so that a few dazzling pixels do not
+    darken the rest. An image that is too large is refused by its header, before anything is decoded.
+    """
+    cv2 = opencv()
+    pixels = _stated_pixels(content)
+    if pixels > MOST_PIXELS:
+        message = f"found an image of more than {MOST_PIXELS / 1e6:g} million pixels, expected at most so many."
+        raise DataError(message, where=Location(source), hint="Save it with fewer pixels, or remove it.")
+    cut = any(content.startswith(head) and tail not in content[-last:] for head, tail, last in _ENDS)
+    image = None
+    if pixels and not cut:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        except cv2.error:  # what it does not know it refuses in many ways
+            image = None
+    if image is None or image.size < _FEWEST_PIXELS:
+        message = "the image is cut off." if cut else "it is not an image that can be read."
+        raise DataError(message, where=Location(source), hint="Save it as PNG again, or remove it.")
+    if image.dtype != np.uint8:
+        image = np.rint(np.nan_to_num(image) * (255.0 / max(float(np.percentile(image, 99)), 1e-9))).clip(0, 255)
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def _stated_pixels(content: bytes) -> float:
+    """How many pixels the header of an image file states; 0 where there is no header of a kind that is read."""
+    pillow = library("PIL.Image", "looking at images")
+    with catch_warnings():
+        simplefilter("ignore")
+        try:
+            with pillow.open(BytesIO(content), formats=_KINDS) as header:
+                return float(header.width * header.height)
+        except pillow.DecompressionBombError:
+            return np.inf
+        except Exception:  # broken headers are refused in many ways
+            return 0.0
+
 
 _AT_ONCE = 8  # corners: their pixels stay in the processor's cache
 _LARGEST = 20

@@ -12,8 +12,8 @@ from armcal.base.arrays import Array
 from armcal.errors import ConfigError
 from numpy.typing import NDArray
 
-from armcal_camera.board import Board, dark_rectangles, outline
-from armcal_camera.images import Grey, opencv
+from armcal_camera.board import Board, dark_rectangles, opencv, outline
+from armcal_camera.detection import Grey
 from armcal_camera.intrinsics import DISTORTION, normalised
 from armcal_camera.start import pose_matrix
 
@@ -35,7 +35,7 @@ class Lens:
     def rays(self, pixels: Array) -> Array:
         """x/z and y/z of the rays to pixels (N x 2)."""
         numbers = (np.array(part) for part in (self.focal, self.centre, self.distortion))
-        return normalised(self.model, pixels.T, *numbers).T
+        return normalised(self.model, pixels, *numbers)
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,7 @@ _USUAL = Exposure(blur=0.7, noise=2.0, light=0.1)
 
 
 def rendered_records(camera: Any, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
-    """The image file of each record; see ``Rendering``.
-
-    Raises:
-        ConfigError: the truth has a bent board, which cannot be drawn.
-    """
+    """The image file of each record; see ``Rendering``."""
     if any(float(values[f"{name}_bend_{axis}"][0]) for name in camera.board_names for axis in "xy"):
         raise ConfigError("found a board that is bent, expected flat ones: images are drawn of these alone.")
     kpx = 1000.0

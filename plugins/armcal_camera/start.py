@@ -21,8 +21,7 @@ from armcal.errors import ProblemError
 from armcal.problem.rigid_alignment import hand_eye as rotations_of
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.board import Board, Chessboard
-from armcal_camera.images import opencv
+from armcal_camera.board import Board, Chessboard, opencv
 
 FEWEST_POINTS = 4  # of a board in an image
 
