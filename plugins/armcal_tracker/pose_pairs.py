@@ -37,11 +37,7 @@ class PosePairsReader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """A record a pair.
-
-        Raises:
-            DataError: the file is none of the two, has a pose that is none, or moves as with the other mounting.
-        """
+        """A record a pair; refused where the pairs move as with the other mounting."""
         path, mounting = self._settings.path, self._settings.mounting
         arm = next((name for name, a in request.arms.items() if set(a.commanded) == set(_FLANGE)), None)
         reading = [name for name, m in request.measurements.items() if {c.name for c in m.channels()} >= {*QUATERNION}]
@@ -60,17 +56,13 @@ class PosePairsReader:
         if mounting == "eye_in_hand":
             markers = np.linalg.inv(markers)
         body = Rotation.from_matrix(markers[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
-        columns = {f"{arm}.{name}": column for name, column in zip(_FLANGE, _flange(hands), strict=True)}
+        flange = [*hands[:, :3, 3].T, *hand.as_euler("ZYX").T]
+        columns = {f"{arm}.{name}": column for name, column in zip(_FLANGE, flange, strict=True)}
         columns |= {f"{reading[0]}.{axis}": markers[:, i, 3] for i, axis in enumerate("xyz")}
         columns |= {f"{reading[0]}.{name}": body[:, i] for i, name in enumerate(QUATERNION)}
         numbers = tuple(range(1, len(hands) + 1))
         digest = hashlib.sha256(content).hexdigest()
         return Dataset(tuple(map(str, numbers)), columns, rows=numbers, source=str(path), sha256=digest)
-
-
-def _flange(hands: Array) -> list[Array]:
-    angles = Rotation.from_matrix(hands[:, :3, :3]).as_euler("ZYX")
-    return [*hands[:, :3, 3].T, *angles.T]
 
 
 def _pairs(path: Any, content: bytes) -> tuple[Array, Array]:

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from armcal.devices.live import REPEATED
-from armcal_tracker.dtrack import messages
-from armcal_tracker.frames import LATE, FrameCounter, UnreadableError
+from armcal_tracker.trackers import LATE, FrameCounter, UnreadableError, messages
 from scipy.spatial.transform import Rotation
 
 # The example of the manual: one body. Its angles stand in the wrong order there: those of its matrix, from the last on.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from armcal.devices.device import DeviceRefusedError
 from armcal.devices.live import REPEATED, TrackerFrame
-from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
+from armcal_tracker.trackers import DTrackSettings, DTrackTracker
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 

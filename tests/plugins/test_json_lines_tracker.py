@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from armcal.devices.clock import RealClock
 from armcal.devices.device import DeviceRefusedError
-from armcal_tracker.frames import UnreadableError
-from armcal_tracker.line_trackers import JsonLinesSettings, JsonLinesTracker, json_frame
+from armcal_tracker.trackers import JsonLinesSettings, JsonLinesTracker, UnreadableError, json_frame
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
