@@ -83,7 +83,6 @@ class ClosedChain(Contact):
         return ca.vertcat(error.translation, se3.rotation_vector(error.rotation))
 
     def noise(self) -> tuple[float, ...]:
-        """Of the position (m) and of the rotation (rad)."""
         return (self._settings.noise,) * 3 + (self._settings.orientation_noise,) * 3
 
     def dimensions(self) -> tuple[str, ...]:

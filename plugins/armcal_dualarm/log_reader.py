@@ -6,14 +6,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NoReturn, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import from_unit
-from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
 from armcal.measure.reader import ReadRequest
@@ -24,18 +23,14 @@ from pydantic import Field, model_validator
 Column = str | int  # A column's name in the header, or its number from 1
 
 
-def read_columns(
+def _read_columns(
     path: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]
 ) -> tuple[Columns, list[str], str]:
-    """Columns of a log, what those of numbers are called in it, and the file's sha256.
-
-    Raises:
-        DataError: with file, line and column.
-    """
+    """Columns of a log, what those of numbers are called in it, and the file's sha256."""
     with open_table(path, "a log", delimiter, empty="Give a row a moment.") as table:
         line, cells = table.first[0], [cell.strip() for cell in table.first[1]]
-        header = cells if is_header(cells, numbers, texts) else []
-        places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
+        header = cells if _is_header(cells, numbers, texts) else []
+        places = [_place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
         names = [header[place] if header else f"column {place + 1}" for place in places[: len(numbers)]]
         named = list(zip(places, names, strict=False))
         read = table.columns(named, places[len(numbers) :], has_header=bool(header))
@@ -45,7 +40,7 @@ def read_columns(
     return replace(read, texts=words), names, table.sha256
 
 
-def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
+def _is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
     """Whether the first row holds names: for columns by name, no number at all; by place, none where one is due."""
     if any(isinstance(column, str) for column in (*numbers, *texts)):
         return not any(is_number(cell) for cell in cells)
@@ -53,12 +48,8 @@ def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[C
     return not any(is_number(cell) for cell in due) and any(not is_missing(cell) for cell in due)
 
 
-def place_of(path: Path, line: int | None, header: Sequence[str], count: int, column: Column) -> int:
-    """Where a column stands, from 0.
-
-    Raises:
-        DataError: it is not there, or several times.
-    """
+def _place_of(path: Path, line: int | None, header: Sequence[str], count: int, column: Column) -> int:
+    """Where a column stands, from 0."""
     if isinstance(column, int):
         if not 1 <= column <= count:
             refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
@@ -153,22 +144,18 @@ class TwoArmLogReader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """The log in SI; ``rows`` are lines, those of a rest's first row.
-
-        Raises:
-            DataError: with file, line and column.
-        """
+        """The log in SI; ``rows`` are lines, those of a rest's first row."""
         s, path = self._settings, self._settings.path
         for name, arm in s.arms.items():
             if name not in request.arms:
-                self._refuse(f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
+                refuse(path, f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
             if len(arm.columns) != (joints := len(request.arms[name].commanded)):
                 text = f"found {len(arm.columns)} columns for the arm {name}, which has {joints} joints."
-                self._refuse(text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
+                refuse(path, text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
         channels = [f"{name}.{joint}" for name in s.arms for joint in request.arms[name].commanded]
         times = [] if s.time is None else [s.time]
         numbers = [*(column for arm in s.arms.values() for column in arm.from_base), *times]
-        read, column_names, digest = read_columns(path, s.delimiter, numbers, list(s.labels.values()))
+        read, column_names, digest = _read_columns(path, s.delimiter, numbers, list(s.labels.values()))
         ratios = np.concatenate([arm.ratios for arm in s.arms.values()])
         joint_angles = np.array(read.numbers[: len(channels)]) / ratios[:, None]
         values = dict(zip(channels, joint_angles, strict=True))
@@ -180,7 +167,7 @@ class TwoArmLogReader:
                 first = int(over[0])
                 text = f"{channel} would stand at {row[first]:.6g} rad there, more than one turn (2 pi rad)."
                 hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
-                self._refuse(text, hint, read.lines[first], names[channel])
+                refuse(path, text, hint, read.lines[first], names[channel])
         if times:
             values["time"] = from_unit(read.numbers[-1], s.time_unit)
         return read_as(self._dataset(read, digest, joint_angles, values), request, names)
@@ -194,7 +181,7 @@ class TwoArmLogReader:
             still = rests(joints, read.texts, values.get("time"), s.still)
             if not still:
                 text = f"found no moment at which no joint moves by more than {np.degrees(s.still.spread):.3g} deg."
-                self._refuse(text, "Give a wider spread_deg or a shorter window under still.")
+                refuse(s.path, text, "Give a wider spread_deg or a shorter window under still.")
             used = sum(rest.stop - rest.start for rest in still)
             rows = f"{used} of {len(read.lines)} rows"
             warnings = (f"{s.path}: the log was reduced to {len(still)} still moments, the means of {rows}.",)
@@ -206,6 +193,3 @@ class TwoArmLogReader:
         texts = {name: tuple(cells[i] for i in starts) for name, cells in zip(s.labels, read.texts, strict=True)}
         ids = tuple(map(str, lines))
         return Dataset(ids, channels, texts, lines, str(s.path), digest, warnings=warnings)
-
-    def _refuse(self, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
-        raise DataError(message, where=Location(str(self._settings.path), line=line, field=column), hint=hint)
