@@ -295,7 +295,13 @@ def dictionary(family: str) -> Any:
 
 def dark_rectangles(board: Board) -> Array:
     """The dark parts, in the board's frame (N x 4: smallest x and y, largest x and y; m)."""
-    parts = [_squares(board), *_tags(board)]
+    parts = _tags(board)
+    if isinstance(board, Chessboard | Charuco):
+        is_chessboard = isinstance(board, Chessboard)
+        columns, rows = board.columns + is_chessboard, board.rows + is_chessboard
+        odd = 0 if isinstance(board, Chessboard) or not board.legacy else 1 - rows % 2
+        dark = np.array([(i, j) for j in range(rows) for i in range(columns) if (i + j) % 2 == odd])
+        parts.insert(0, board.square * np.hstack([dark - 1, dark]))
     ends = np.concatenate(parts)
     return np.hstack([np.minimum(ends[:, :2], ends[:, 2:]), np.maximum(ends[:, :2], ends[:, 2:])])
 
@@ -306,16 +312,6 @@ def outline(board: Board) -> Array:
     if isinstance(board, Chessboard | Charuco):
         low = np.array([-board.square, -board.square])
     return np.array([*low, *(low + board.layout.extent)])
-
-
-def _squares(board: Board) -> Array:
-    if not isinstance(board, Chessboard | Charuco):
-        return np.zeros((0, 4))
-    is_chessboard = isinstance(board, Chessboard)
-    columns, rows = board.columns + is_chessboard, board.rows + is_chessboard
-    odd = 0 if isinstance(board, Chessboard) or not board.legacy else 1 - rows % 2
-    dark = np.array([(i, j) for j in range(rows) for i in range(columns) if (i + j) % 2 == odd])
-    return np.asarray(board.square * np.hstack([dark - 1, dark]))
 
 
 def _tags(board: Board) -> list[Array]:

@@ -355,12 +355,18 @@ def _other_board(image: Grey, nothing: Detection) -> Detection:
 
 
 def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detection:
-    seen, places, is_double = _seen_tags(reduced, board)
-    if not len(seen):
+    layout = board.layout
+    corners_of, ids = _detected(reduced, layout.tag_family, getattr(board, "border_bits", 1))
+    ours = [(i, corners) for i, corners in zip(ids, corners_of, strict=True) if i in layout.tag_ids]
+    numbers = [i for i, _ in ours]
+    if not ours:
         return _other_tags(reduced, board, nothing)
-    if is_double:
-        return replace(nothing, fault=f"the tag {is_double[0]} was found {is_double[1]} times")
-    known, pixels = board.tag_corners[seen, :, :2], _enlarged(places, reduced, image).reshape(-1, 4, 2)
+    double = next((i for i in numbers if numbers.count(i) > 1), None)
+    if double is not None:
+        return replace(nothing, fault=f"the tag {double} was found {numbers.count(double)} times")
+    seen = [layout.tag_ids.index(i) for i in numbers]
+    known = board.tag_corners[seen, :, :2]
+    pixels = _enlarged([corners for _, corners in ours], reduced, image).reshape(-1, 4, 2)
     if isinstance(board, Charuco) and board.rows % 2 == 0:
         other = board.model_copy(update={"legacy": not board.legacy})
         if _astray(other.tag_corners[seen, :, :2], pixels) < _astray(known, pixels):
@@ -372,15 +378,15 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
         return replace(nothing, fault=f"{text}: check its columns, rows, spacing and first_id")
     corners_known, points = known.reshape(-1, 2), board.points[:, :2]
     away = np.linalg.norm(points[:, None] - corners_known[None], axis=2).min(axis=1)
-    near = np.flatnonzero(away < (0.99 * board.layout.step if isinstance(board, Charuco) else 1e-9))
+    near = np.flatnonzero(away < (0.99 * layout.step if isinstance(board, Charuco) else 1e-9))
     rough, scale = local_map(corners_known, pixels.reshape(-1, 2), points[near])
-    fit = refine(image, rough, scale, board.layout.reach)
+    fit = refine(image, rough, scale, layout.reach)
     corners = nothing.corners.copy()
     corners[near] = fit.corners
     there = points[np.isfinite(corners[:, 0])]
     count = len(there)
     # in a line they do not say how the board lies
-    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * board.layout.step:
+    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * layout.step:
         return replace(nothing, fault=f"too few corners of the {board.kind} were found ({count} of {len(points)})")
     return replace(nothing, corners=corners, fault="", blur=float(np.nanmedian(fit.blur)))
 
@@ -415,17 +421,6 @@ def _detected(reduced: Grey, family: str, border_bits: int) -> tuple[Any, list[i
     parameters.markerBorderBits = border_bits
     corners, ids, _ = aruco.ArucoDetector(dictionary(family), parameters).detectMarkers(reduced)
     return corners, [] if ids is None else [int(i) for i in ids.ravel()]
-
-
-def _seen_tags(reduced: Grey, board: Board) -> tuple[list[int], Array, tuple[int, int] | None]:
-    """Which of the board's tags are seen (T), their corners (T x 4 x 2, px), and an id that stands there twice."""
-    layout = board.layout
-    corners, ids = _detected(reduced, layout.tag_family, getattr(board, "border_bits", 1))
-    ours = [(i, c) for i, c in zip(ids, corners, strict=True) if i in layout.tag_ids]
-    numbers = [i for i, _ in ours]
-    double = next(((i, numbers.count(i)) for i in numbers if numbers.count(i) > 1), None)
-    places = np.array([c.reshape(4, 2) for _, c in ours]).reshape(-1, 4, 2)
-    return [layout.tag_ids.index(i) for i in numbers], places, double
 
 
 def _turned(known: Array, pixels: Array) -> tuple[Array, float]:

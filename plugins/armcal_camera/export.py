@@ -195,27 +195,20 @@ def cameras(result: RunResult) -> ReportSection | None:
     for name, measurement in result.system.measurements.items():
         rows = len(measurement.noise())
         if described[name]["type"] == "camera":
-            own = result.errors.calibrated_residual_mm[start : start + rows]
-            places, off = _residuals(result, name, cast("Camera", measurement), own)
-            parts += [_over_the_sensor(name, places, off), _by_image(name, result.dataset.ids, off)]
+            camera, residual = cast("Camera", measurement), result.errors.calibrated_residual_mm[start : start + rows]
+            shape = (len(camera.points), 2, len(result.dataset))
+            seen = result.dataset.stacked([f"{name}.{channel.name}" for channel in camera.channels()])
+            # Where it saw corners, and measured minus predicted (2 x P x N each, px); NaN of those not seen
+            places, off = (numbers.reshape(shape).transpose(1, 0, 2) for numbers in (_PX * seen, residual))
+            off = np.where(np.isfinite(places).all(axis=0), off, np.nan)
+            count = np.isfinite(off[0]).sum(axis=0)
+            errors = np.sqrt(np.nansum(off**2, axis=(0, 1)) / np.maximum(count, 1))
+            order = [int(i) for i in np.argsort(-errors)[:_WORST] if count[i]]
+            worst = [(result.dataset.ids[i], significant(float(errors[i])), str(count[i])) for i in order]
+            title = f"{name}: the images with the largest errors"
+            parts += [_over_the_sensor(name, places, off), Table(title, ("Image", "rms, px", "Corners"), worst)]
         start += rows
     return ReportSection("Cameras", parts=parts) if parts else None
-
-
-def _residuals(result: RunResult, name: str, camera: Camera, residual: Array) -> tuple[Array, Array]:
-    """Where one camera saw corners, and measured minus predicted (2 x P x N each, px); NaN of those not seen."""
-    shape = (len(camera.points), 2, len(result.dataset))
-    seen = result.dataset.stacked([f"{name}.{channel.name}" for channel in camera.channels()])
-    places, off = (rows.reshape(shape).transpose(1, 0, 2) for rows in (_PX * seen, residual))
-    return places, np.where(np.isfinite(places).all(axis=0), off, np.nan)
-
-
-def _by_image(name: str, images: tuple[str, ...], off: Array) -> Table:
-    square, count = np.nansum(off**2, axis=(0, 1)), np.isfinite(off[0]).sum(axis=0)
-    errors = np.sqrt(square / np.maximum(count, 1))
-    order = [int(i) for i in np.argsort(-errors)[:_WORST] if count[i]]
-    rows = [(images[i], significant(float(errors[i])), str(count[i])) for i in order]
-    return Table(f"{name}: the images with the largest errors", ("Image", "rms, px", "Corners"), rows)
 
 
 def _over_the_sensor(name: str, places: Array, off: Array) -> Figure:

@@ -112,7 +112,11 @@ class ImagesReader:
                 raise DataError(f"{text}.", where=Location(str(folder)), hint=f"Correct measurements.{name}.")
             chosen = _matched(dataset, views, str(folder), count)
             faults.append({i: views[image].fault for i, image in enumerate(chosen) if views[image].fault})
-            dataset = _with_corners(dataset, name, [views[image] for image in chosen], known)
+            seen = [views[image] for image in chosen]
+            pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in seen]
+            channels = _corner_channels(name, np.stack(pixels, axis=1), known)
+            digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in seen)]).encode()).hexdigest()
+            dataset = replace(dataset, channels={**dataset.channels, **channels}, sha256=digest)
             ids = tuple(chosen)
         blind = set.intersection(*(set(fault) for fault in faults))  # of several cameras one will do
         dataset = _left(replace(dataset, ids=ids), {i: "; ".join(fault[i] for fault in faults) for i in blind})
@@ -132,7 +136,6 @@ def _own(places: Path | Mapping[str, Path], camera: str, cameras: int) -> Path:
 
 
 def _views(folder: Path, boards: tuple[Board, ...], report: Report) -> dict[str, View]:
-    """What each image of a camera says, by its name."""
     paths = _images_in(folder)
     made = Executor().map(partial(_look, boards), paths, report)
     return {path.name: view for path, view in zip(paths, made, strict=True)}
@@ -143,7 +146,6 @@ def _look(boards: Sequence[Board], path: Path) -> View:
 
 
 def _look_at(boards: Sequence[Board], content: bytes, name: str) -> View:
-    """What an image file's content says of boards."""
     digest, nothing = hashlib.sha256(content).hexdigest(), np.full((sum(len(b.points) for b in boards), 2), np.nan)
     try:
         image = grey_image(content, name)
@@ -254,19 +256,13 @@ def _corner_channels(camera: str, corners: Array, known: Collection[str]) -> dic
     }
 
 
-def _with_corners(dataset: Dataset, camera: str, views: Sequence[View], known: set[str]) -> Dataset:
-    pixels = [np.full_like(view.corners, np.nan) if view.fault else view.corners for view in views]
-    channels = _corner_channels(camera, np.stack(pixels, axis=1), known)
-    digest = hashlib.sha256("".join([dataset.sha256, *(view.sha256 for view in views)]).encode()).hexdigest()
-    return replace(dataset, channels={**dataset.channels, **channels}, sha256=digest)
-
-
 def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:
     """The dataset without images that say nothing, which are listed."""
     named: dict[str, list[str]] = {}
     for i, reason in sorted(faulty.items()):
         named.setdefault(reason, []).append(dataset.ids[i])
-    shown = "; ".join(f"{', '.join(ids[:_NAMED])}{_more(ids)}: {reason}" for reason, ids in named.items())
+    more = {reason: f" and {len(ids) - _NAMED} more" if len(ids) > _NAMED else "" for reason, ids in named.items()}
+    shown = "; ".join(f"{', '.join(ids[:_NAMED])}{more[reason]}: {reason}" for reason, ids in named.items())
     kept = len(dataset) - len(faulty)
     if kept < _FEWEST:
         message = f"found {kept} of {len(dataset)} images that can be used, expected at least {_FEWEST} ({shown})."
@@ -276,10 +272,6 @@ def _left(dataset: Dataset, faulty: Mapping[int, str]) -> Dataset:
         return dataset
     warning = f"{len(faulty)} of {len(dataset)} images are set aside: {shown}."
     return replace(dataset.without(faulty), warnings=(*dataset.warnings, warning))
-
-
-def _more(names: Sequence[str]) -> str:
-    return f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
 
 
 _WAITING = 5  # So many images a driver may hold back: they are older than the moment of asking

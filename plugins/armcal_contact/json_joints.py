@@ -121,7 +121,7 @@ class _Messages:
 
     def _keys(self, content: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
         """The key of each channel and its unit."""
-        found: dict[str, tuple[str, str]] = {}
+        keys: dict[str, tuple[str, str]] = {}
         for channel, own in self._names.items():
             spelt = [(key, unit) for name in own for key, unit in self._spelt(name) if key in content]
             if len(spelt) > 1:
@@ -129,15 +129,15 @@ class _Messages:
             if spelt and not spelt[0][1]:
                 raise _RefusedLine(f"{spelt[0][0]} has no unit: call it {spelt[0][0]}_rad, or give unit: rad")
             if spelt:
-                found[channel] = spelt[0]
-        lacking = [own[-1] for channel, own in self._names.items() if channel not in found]
-        used = {key for key, _ in found.values()}
+                keys[channel] = spelt[0]
+        lacking = [own[-1] for channel, own in self._names.items() if channel not in keys]
+        used = {key for key, _ in keys.values()}
         beyond = [key for key in content if key not in used and self._is_joint(key)]
         if lacking or beyond:
             which = f"no {lacking[0]}" if lacking else f"{beyond[0]}, which is none of the arm's"
-            count = len(found) + len(beyond)
+            count = len(keys) + len(beyond)
             raise _RefusedLine(f"it has {count} joints, expected {len(self._names)}: found {which}")
-        return found
+        return keys
 
     def _spelt(self, name: str) -> list[tuple[str, str]]:
         split = split_suffix(name)
