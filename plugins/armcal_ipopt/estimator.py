@@ -5,8 +5,6 @@ with the data. Where semidefinite matrices are free, it begins with steps of qua
 are kept exactly: its bound relaxation is off. It also ends, converged, where the best step left
 would lower the cost by no more than its rounding errors.
 
-Steps over semidefinite matrices before the fit itself.
-
 Residuals are nearly linear in a matrix, and far from it in its root, which IPOPT moves: a search over all records would
 take hundreds of steps along the root's curves. So it first searches a quadratic model of the cost in the matrix's own
 entries, which needs no records, and the model is made anew where that ends.
@@ -47,17 +45,10 @@ _SUFFICIENT, _TRUSTED = 1e-4, 0.75
 class Posed(Protocol):
     """What IPOPT needs to know of a cost over ``x`` (n), as of a ``PosedProblem``."""
 
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of ``x``."""
-
-    def cost(self, x: Array) -> float:
-        """The cost; infinite where there is none."""
-
-    def model(self, x: Array) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian."""
-
-    def exact_hessian(self, x: Array) -> Array:
-        """The Hessian."""
+    def bounds(self) -> tuple[Array, Array]: ...
+    def cost(self, x: Array) -> float: ...  # infinite where there is none
+    def model(self, x: Array) -> NormalEquations: ...  # Gauss-Newton
+    def exact_hessian(self, x: Array) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -119,7 +110,7 @@ def approached(posed: PosedProblem, x: Array, solved: Callable[[Posed, Array], A
 
 
 def _model(posed: PosedProblem, x: Array) -> NormalEquations | None:
-    """The quadratic model by coordinates; None where the arm has no equilibrium."""
+    """By coordinates; None where the arm has no equilibrium."""
     try:
         return posed.convex_model(x)
     except NotConvergedError:
@@ -173,12 +164,7 @@ class IpoptEstimator:
     def spread(self, executor: Executor) -> IpoptEstimator:
         return IpoptEstimator(self._settings, executor)
 
-    def solve(
-        self,
-        problem: Problem,
-        start: Array,
-        progress: Progress = no_progress,
-    ) -> Solution:
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
         """The best of one or several starts; the first is ``start`` itself."""
         began = time.perf_counter()
         if not problem.increments:
@@ -271,7 +257,7 @@ def _solver(settings: IpoptSettings, callbacks: list[_Callback], watch: _Watch, 
 
 @dataclass(frozen=True)
 class _Run:
-    """One start's end: where, at what cost, and in IPOPT's words why it stopped."""
+    """One start's end; ``status`` is in IPOPT's words."""
 
     x: Array
     cost: float

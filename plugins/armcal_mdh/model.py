@@ -115,7 +115,6 @@ class MdhModel:
         return tuple(blocks + [_block(n, v) for n, v in self._step_values("tool", self._settings.tool)])
 
     def chain(self, values: Mapping[str, Any]) -> Chain:
-        """The rows as a chain; every row's motion is about or along z."""
         joints: list[Joint] = []
         frames: dict[str, Attachment] = {}
         pending = se3.identity()

@@ -74,15 +74,13 @@ JointSettings = Annotated[RevoluteSettings | PrismaticSettings, Field(discrimina
 class PoeSettings(Settings):
     """An arm in screws, all given in the base frame at zero angles.
 
-    Attributes:
-        mount: where the arm stands, for springs at the base and masses on it; it moves nothing.
-        parametrisation: ``minimal`` keeps axes axes: four numbers for a joint that turns, two for one that slides.
-            ``full`` gives every joint six free numbers.
+    ``parametrisation: minimal`` keeps axes axes: four numbers for a joint that turns, two for one that slides;
+    ``full`` gives every joint six free numbers.
     """
 
     joints: Annotated[tuple[JointSettings, ...], Field(min_length=1)]  # from the base to the tip
     tool: PoseSettings  # the pose of the tool at zero angles
-    mount: PoseSettings = PoseSettings.si()
+    mount: PoseSettings = PoseSettings.si()  # for springs at the base and masses on it; it moves nothing
     parametrisation: Literal["minimal", "full"] = "minimal"
 
     @property
@@ -110,10 +108,10 @@ _Z: Vector3 = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class NominalAxis:
-    """An axis as configured: a unit direction and a point on it (m), in the base frame."""
+    """An axis as configured, in the base frame."""
 
-    direction: Array
-    point: Array
+    direction: Array  # unit
+    point: Array  # on it (m)
 
     @property
     def twist(self) -> Array:
@@ -186,11 +184,9 @@ class PoeModel:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """As configured, else q1, q2, ..."""
         return self._settings.joint_names
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Every joint's axis and offset, and the tool."""
         blocks: list[ParameterBlock] = []
         for i, (joint, axis) in enumerate(zip(self._settings.joints, self._axes, strict=True), start=1):
             turns = isinstance(joint, RevoluteSettings)

@@ -45,20 +45,11 @@ _OTHER_NAMES: dict[str, Encoding] = {
 
 
 def read_text(path: Path) -> tuple[str, Encoding]:
-    """The text of a file and its encoding.
-
-    Raises:
-        ConfigError: it cannot be read, is too large, or is not in the encoding that it declares.
-    """
     return decode(input_bytes(path, _MOST, "a URDF file", ConfigError), str(path))
 
 
 def decode(data: bytes, label: str) -> tuple[str, Encoding]:
-    """Text and encoding; ``encode`` gives the same bytes back.
-
-    Raises:
-        ConfigError: too large, of an encoding that is not known, or not in the one it declares.
-    """
+    """Text and encoding; ``encode`` gives the same bytes back."""
     if len(data) > MAX_BYTES:
         raise ConfigError(
             f"the file is larger than {MAX_BYTES // 1024} KiB, which a calibration could not hold.",
@@ -82,9 +73,6 @@ def declared(text: str, label: str) -> Encoding | None:
     """The encoding that the text's first line declares, None if it declares none.
 
     UTF-16 cannot be recognised by the declaration alone, and a declaration of it in another encoding is wrong.
-
-    Raises:
-        ConfigError: it is not one of those known.
     """
     match = _DECLARED.match(text)
     if match is None:
@@ -103,11 +91,6 @@ def declared(text: str, label: str) -> Encoding | None:
 
 
 def encode(text: str, encoding: Encoding) -> bytes:
-    """The bytes of a text.
-
-    Raises:
-        ValueError: it holds a character that the encoding has not.
-    """
     try:
         return text.encode(encoding)
     except UnicodeEncodeError as fault:
@@ -128,8 +111,6 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class Element:
-    """One element."""
-
     tag: str  # its name
     attributes: Mapping[str, str]  # values by name, references expanded
     line: int  # of its start tag, from 1
@@ -141,22 +122,13 @@ class Element:
         return (child for child in self.children if child.tag == tag)
 
     def one(self, tag: str) -> Element | None:
-        """The child of a name; None if there is none.
-
-        Raises:
-            ConfigError: it stands twice.
-        """
         elements = list(self.all(tag))
         if len(elements) > 1:
             elements[1].refuse(f"found <{tag}> twice in one <{self.tag}>.", f"The first is at line {elements[0].line}.")
         return elements[0] if elements else None
 
     def text(self, name: str) -> str:
-        """An attribute that has to be there and hold something.
-
-        Raises:
-            ConfigError: it is missing or empty.
-        """
+        """An attribute that has to be there and hold something."""
         value = self.attributes.get(name, "")
         if not value.strip():
             which = "an empty" if name in self.attributes else "no"
@@ -168,11 +140,6 @@ class Element:
 
 
 def read_elements(text: str, label: str) -> Element:
-    """The root element of a text.
-
-    Raises:
-        ConfigError: not well-formed, a document type, or nested too deeply; with file and line.
-    """
     try:
         data = text.encode(UTF8)
     except UnicodeEncodeError as fault:
@@ -229,20 +196,10 @@ def words_of(value: str) -> list[str]:
 
 
 def number(element: Element, name: str, default: float, largest: float = LARGEST) -> float:
-    """One number; the default where there is no such attribute.
-
-    Raises:
-        ConfigError: not one number.
-    """
     return numbers(element, name, (default,), largest)[0]
 
 
 def three(element: Element | None, name: str, default: Three = (0.0, 0.0, 0.0)) -> Three:
-    """Three numbers; the default where there is no such element or attribute.
-
-    Raises:
-        ConfigError: not three numbers.
-    """
     if element is None:
         return default
     x, y, z = numbers(element, name, default, LARGEST)
@@ -250,11 +207,7 @@ def three(element: Element | None, name: str, default: Three = (0.0, 0.0, 0.0)) 
 
 
 def numbers(element: Element, name: str, default: tuple[float, ...], largest: float) -> tuple[float, ...]:
-    """As many numbers as the default has.
-
-    Raises:
-        ConfigError: another count, or what is no finite decimal number of typical size.
-    """
+    """As many numbers as the default has."""
     if name not in element.attributes:
         return default
     words = words_of(element.attributes[name])
@@ -277,11 +230,7 @@ def numbers(element: Element, name: str, default: tuple[float, ...], largest: fl
 
 
 def unit_axis(element: Element | None) -> Three:
-    """The direction of an <axis>, of length one; x where there is none, by the format.
-
-    Raises:
-        ConfigError: there are none in it, not three, or all zero.
-    """
+    """The direction of an <axis>, of length one; x where there is none, by the format."""
     if element is not None:
         element.text("xyz")
     x, y, z = three(element, "xyz", (1.0, 0.0, 0.0))
@@ -312,18 +261,14 @@ _ANY = sys.float_info.max
 
 @dataclass(frozen=True)
 class UrdfLink:
-    """A link: its mass (kg, 0 where none is stated) and the mass's centre in the link's frame (m)."""
-
     name: str
-    mass: float
-    com: Three
+    mass: float  # kg, 0 where none is stated
+    com: Three  # the mass's centre in the link's frame (m)
     element: Element
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint."""
-
     name: str  # as written
     kind: str  # ``revolute``, ``continuous``, ``prismatic``, ``fixed``, ``floating`` or ``planar``
     parent: str  # link it stands on
@@ -380,15 +325,7 @@ class Robot:
 
 
 def read_robot(text: str, label: str) -> Robot:
-    """The links and joints of a URDF.
-
-    Args:
-        text: the URDF.
-        label: the file's name, for messages.
-
-    Raises:
-        ConfigError: it is no URDF, or describes what cannot be; with file and line.
-    """
+    """The links and joints of a URDF; ``label`` is the file's name, for messages."""
     top = read_elements(text, label)
     if top.tag != "robot":
         top.refuse(f"found <{top.tag}> at the top, expected <robot>.", "Give a URDF file.")
