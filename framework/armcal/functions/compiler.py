@@ -43,11 +43,8 @@ def find_compiler() -> str | None:
     named = os.environ.get("ARMCAL_CC", "")
     if named == "none":
         return None
-    for name in [named] if named else [os.environ.get("CC", ""), "cc", "gcc", "clang"]:
-        text = shutil.which(name) if name else None
-        if text:
-            return text
-    return None
+    names = [named] if named else [os.environ.get("CC", ""), "cc", "gcc", "clang"]
+    return next((path for name in names if name and (path := shutil.which(name))), None)
 
 
 def cache_directory() -> Path:
@@ -88,9 +85,7 @@ def _library_name(key: str, content: bytes) -> str:
 
 def _is_ours(path: Path) -> bool:
     seen = path.stat()
-    return not hasattr(os, "getuid") or (
-        seen.st_uid == os.getuid() and not seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    )
+    return seen.st_uid == os.getuid() and not seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def compile_now(key: str, source: Callable[[], str], entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
