@@ -18,19 +18,7 @@ from armcal.base.settings import InputPath, Settings
 from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
-from armcal_urdf.robot import (
-    FREE,
-    MAX_BYTES,
-    MOVING,
-    Encoding,
-    Robot,
-    Three,
-    UrdfJoint,
-    declared,
-    encode,
-    read_robot,
-    read_text,
-)
+from armcal_urdf.robot import FREE, MAX_BYTES, MOVING, Encoding, Robot, Three, UrdfJoint, read_robot, read_text
 
 _UNFIT = re.compile(r"[^A-Za-z0-9_-]")
 
@@ -236,9 +224,9 @@ class UrdfSettings(Settings):
             content["text"], content["encoding"] = read_text(self.path)
             content["file"] = self.path.name
         elif self.encoding is None:
-            content["encoding"] = declared(self.text, label) or "utf-8"
+            content["encoding"] = "utf-8"
         robot = read_robot(content["text"], label)
-        encode(content["text"], content.get("encoding") or self.encoding or "utf-8")
+        content["text"].encode(content.get("encoding") or self.encoding)
         content["root"], content["tip"] = ends(robot, self.root, self.tip)
         for name, value in content.items():
             object.__setattr__(self, name, value)
@@ -276,7 +264,7 @@ class UrdfSettings(Settings):
 
     @property
     def content(self) -> bytes:
-        return encode(self.text, self.encoding or "utf-8")
+        return self.text.encode(self.encoding or "utf-8")
 
 
 def turned(rpy: Three, angle: float) -> Three:

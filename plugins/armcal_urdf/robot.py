@@ -8,7 +8,6 @@ comments are passed over.
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import math
 import re
@@ -16,32 +15,19 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Literal, NoReturn, get_args
+from typing import Literal, NoReturn
 from xml.parsers import expat
 
 from armcal.arm.model import Mimic
 from armcal.errors import ConfigError, Location
 from armcal.io.plain_files import input_bytes
 
-Encoding = Literal["utf-8", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
+Encoding = Literal["utf-8", "iso-8859-1"]
 
 MAX_BYTES = 256 * 1024  # Of a URDF: a calibration holds it whole, and may have four times as many itself
 _MOST = 1 << 26  # Read at all, so that what is too large is refused with the reason
-_MARKS: tuple[tuple[bytes, Encoding], ...] = (
-    (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF16_LE, "utf-16-le"),
-    (codecs.BOM_UTF16_BE, "utf-16-be"),
-    (b"<\0", "utf-16-le"),
-    (b"\0<", "utf-16-be"),
-)
-_DECLARED = re.compile(r"""\ufeff?<\?xml\s[^>]*?encoding\s*=\s*["']([^"'>]*)["']""")
-_OTHER_NAMES: dict[str, Encoding] = {
-    "utf8": "utf-8",
-    "ascii": "us-ascii",
-    "latin-1": "iso-8859-1",
-    "latin1": "iso-8859-1",
-}
 
 
 def read_text(path: Path) -> tuple[str, Encoding]:
@@ -49,56 +35,19 @@ def read_text(path: Path) -> tuple[str, Encoding]:
 
 
 def decode(data: bytes, label: str) -> tuple[str, Encoding]:
-    """Text and encoding; ``encode`` gives the same bytes back."""
+    """Text and encoding: UTF-8, or Latin-1 where it is none, whatever the first line declares."""
     if len(data) > MAX_BYTES:
         raise ConfigError(
             f"the file is larger than {MAX_BYTES // 1024} KiB, which a calibration could not hold.",
             where=Location(label),
             hint="Keep meshes in files of their own, and leave out what is not the arm.",
         )
-    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), None)
-    encoding = encoding or declared(data[:200].decode("iso-8859-1"), label) or "utf-8"
     try:
-        return data.decode(encoding), encoding
-    except UnicodeDecodeError as fault:
-        line = data.count(b"\n", 0, fault.start) + 1
-        raise ConfigError(
-            f"the bytes at offset {fault.start} are not {encoding}.",
-            where=Location(label, line),
-            hint="Save the file as UTF-8, or declare its encoding in the first line.",
-        ) from fault
+        return data.decode("utf-8"), "utf-8"
+    except UnicodeDecodeError:
+        return data.decode("iso-8859-1"), "iso-8859-1"
 
 
-def declared(text: str, label: str) -> Encoding | None:
-    """The encoding that the text's first line declares, None if it declares none.
-
-    UTF-16 cannot be recognised by the declaration alone, and a declaration of it in another encoding is wrong.
-    """
-    match = _DECLARED.match(text)
-    if match is None:
-        return None
-    name = match[1].lower()
-    name = _OTHER_NAMES.get(name, name)
-    known = {encoding: encoding for encoding in get_args(Encoding)}
-    if name not in known or name.startswith("utf-16"):
-        raise ConfigError(
-            f"found the encoding {match[1]!r}, expected UTF-8, UTF-16, ISO-8859-1 or US-ASCII and a text in it.",
-            where=Location(label, 1),
-            hint="Save the file as UTF-8.",
-        )
-    result: Encoding = known[name]
-    return result
-
-
-def encode(text: str, encoding: Encoding) -> bytes:
-    try:
-        return text.encode(encoding)
-    except UnicodeEncodeError as fault:
-        line = text.count("\n", 0, fault.start) + 1
-        raise ValueError(f"line {line} of the URDF holds {text[fault.start]!r}, which {encoding} has not") from fault
-
-
-MAX_DEPTH = 50
 UTF8 = "utf-8"
 Three = tuple[float, float, float]
 
@@ -140,16 +89,10 @@ class Element:
 
 
 def read_elements(text: str, label: str) -> Element:
-    try:
-        data = text.encode(UTF8)
-    except UnicodeEncodeError as fault:
-        line = text.count("\n", 0, fault.start) + 1
-        hint = "Delete it."
-        raise ConfigError("found half a surrogate pair.", where=Location(label or None, line), hint=hint) from fault
     parser = expat.ParserCreate(UTF8)
     builder = _Builder(parser, label, is_expanded="${" not in text)
     try:
-        parser.Parse(data, True)
+        parser.Parse(text.encode(UTF8), True)
     except expat.ExpatError as fault:
         raise ConfigError(
             f"this is not well-formed XML: {expat.ErrorString(fault.code)}.",
@@ -175,8 +118,6 @@ class _Builder:
         element = Element(tag, attributes, line, start, self._label)
         if tag.startswith("xacro:") and not (tag == _PROPERTY and self._is_expanded):
             element.refuse(f"found <{tag}>: this is xacro, not yet a URDF.", "Run it through xacro first.")
-        if len(self._open) >= MAX_DEPTH:
-            element.refuse(f"elements are nested deeper than {MAX_DEPTH} levels.", "A URDF needs five.")
         (self._open[-1].children if self._open else self.root).append(element)
         self._open.append(element)
 
@@ -340,7 +281,7 @@ def read_robot(text: str, label: str) -> Robot:
     if not links:
         top.refuse("found no <link> in <robot>, expected links and joints.", "Give a whole URDF.")
     robot = Robot(links, joints, tuple(dict.fromkeys(_ignored(top))))
-    _require_tree(robot, top)
+    _require_tree(robot)
     return robot
 
 
@@ -448,7 +389,7 @@ def _refuse_alike(element: Element, text: str, name: str, known: tuple[str, ...]
         element.refuse(f"found {text}, which nothing reads.", f"Did you mean {near[0]}?")
 
 
-def _require_tree(robot: Robot, top: Element) -> None:
+def _require_tree(robot: Robot) -> None:
     carried: dict[str, UrdfJoint] = {}
     for joint in robot.joints.values():
         for which, link in (("parent", joint.parent), ("child", joint.child)):
@@ -470,23 +411,10 @@ def _require_tree(robot: Robot, top: Element) -> None:
             f"found {len(roots)} links that no joint carries ({', '.join(roots[:5])}), expected one root.",
             "Join them, or remove what does not belong to the arm.",
         )
-    _refuse_circle(robot, roots[0] if roots else None, top)
-
-
-def _refuse_circle(robot: Robot, root: str | None, top: Element) -> None:
-    reached: set[str] = set()
-    waiting = [root] if root is not None else []
-    while waiting:
-        link = waiting.pop()
-        reached.add(link)
-        waiting += [joint.child for joint in robot.below[link]]
-    beyond = [joint for joint in robot.joints.values() if joint.child not in reached]
-    if beyond:
-        circle = [beyond[0].name]
-        here = robot.above[beyond[0].parent]
-        while here.name not in circle:
-            circle.append(here.name)
-            here = robot.above[here.parent]
-        beyond[0].element.refuse(
-            f"joints go round in a circle: {', '.join(reversed(circle))}.", "A URDF is a tree; remove one of them."
-        )
+    try:
+        TopologicalSorter({joint.child: [joint.parent] for joint in robot.joints.values()}).prepare()
+    except CycleError as fault:
+        circle = [robot.above[link] for link in fault.args[1][1:]]
+        names = ", ".join(joint.name for joint in circle)
+        first = min(circle, key=lambda joint: joint.element.line).element
+        first.refuse(f"joints go round in a circle: {names}.", "A URDF is a tree; remove one of them.")
