@@ -1,4 +1,9 @@
-"""Logs of several arms' motors: columns in a robot's own order, in motor radians. [Bergstrom2016]"""
+"""Two arms: clamped together at their tools, a closed chain; and logs of the motors of several arms. [Bergstrom2016]
+
+A clamp is found along with the arms. The pose of the right tool in the left one is the clamp's, whatever the joints do.
+What the joints give instead is the closing error, and it belongs to both arms at once: it is not split between them.
+A log has its columns in a robot's own order, in motor radians.
+"""
 
 import difflib
 import math
@@ -6,19 +11,101 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+import casadi as ca
 import numpy as np
+from armcal.arm.assembly import ArmState
+from armcal.base import se3
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.settings import InputPath, Settings
+from armcal.base.parameters import ParameterBlock
+from armcal.base.poses import PoseSettings, pose_blocks, pose_transform, quaternion_expression
+from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.base.units import from_unit
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
+from armcal.measure.instrument import Contact
 from armcal.measure.reader import ReadRequest
 from armcal.measure.rests import StillSettings, rests
 from armcal.measure.tables import Columns, is_missing, is_number, open_table
 from pydantic import Field, model_validator
+
+
+class ClosedChainSettings(Settings):
+    """Which two arms hold each other, how well the clamp holds (standard deviations), and what is known of it.
+
+    ``clamps`` are the poses of the right tool in the left one that are known, by the clamp's name: a record's text
+    columns ``group_labels`` joined by a slash, or ``one`` if there are none. A clamp that is not named here is found;
+    one that is named is held, unless ``parameters.free`` frees it, best under a prior.
+    """
+
+    left: str = "left"
+    right: str = "right"
+    noise: Annotated[Length, Field(gt=0)]
+    orientation_noise: Annotated[Angle, Field(gt=0)]
+    group_labels: tuple[str, ...] = ()
+    clamps: dict[str, PoseSettings] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _sane(self) -> Self:
+        if self.left == self.right:
+            raise ValueError(f"found {self.left} on both sides, expected two arms")
+        return self
+
+
+class ClosedChain(Contact):
+    """The measurement ``closed_chain``: of each clamp the blocks clamp_x, clamp_y, clamp_z and clamp_rotation."""
+
+    Settings: ClassVar[type[ClosedChainSettings]] = ClosedChainSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "noise_mm": 0.1,
+        "orientation_noise_mrad": 0.5,
+        "clamps": {"one": {"position_mm": [0, 0, 40], "rpy_deg": [180, 0, 90]}},
+    }
+
+    def __init__(self, settings: ClosedChainSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        for name in (settings.left, settings.right):
+            if name not in arm_names:
+                raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(arm_names)}")
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        return (self._settings.left, self._settings.right)
+
+    @property
+    def group_labels(self) -> tuple[str, ...]:
+        return self._settings.group_labels
+
+    def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
+        known = self._settings.clamps.get(group)
+        blocks = pose_blocks("clamp") if known is None else known.blocks("clamp")
+        return tuple(replace(block, free=known is None) for block in blocks)
+
+    def named_groups(self) -> tuple[str, ...]:
+        return tuple(self._settings.clamps)
+
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        between = self._between(arms)
+        place = {f"clamp_{axis}": between.translation[i] for i, axis in enumerate("xyz")}
+        return {**place, "clamp_rotation": quaternion_expression(between.rotation)}
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """The closing error in the clamp's right frame: position (3, m) and rotation vector (3, rad)."""
+        error = pose_transform("clamp", values).inverse() @ self._between(arms)
+        return ca.vertcat(error.translation, se3.rotation_vector(error.rotation))
+
+    def noise(self) -> tuple[float, ...]:
+        return (self._settings.noise,) * 3 + (self._settings.orientation_noise,) * 3
+
+    def dimensions(self) -> tuple[str, ...]:
+        return ("length",) * 3 + ("angle",) * 3
+
+    def _between(self, arms: Mapping[str, ArmState]) -> se3.Transform:
+        left, right = (arms[name].base_T_tool for name in self.arms)
+        return left.inverse() @ right
+
 
 Column = str | int  # A column's name in the header, or its number from 1
 
@@ -91,10 +178,6 @@ class ArmColumns(Settings):
     def from_base(self) -> tuple[Column, ...]:
         return tuple(self.columns[number - 1] for number in self.order or range(1, len(self.columns) + 1))
 
-    @property
-    def ratios(self) -> Array:
-        return np.ones(len(self.columns)) if self.gear_ratios is None else np.array(self.gear_ratios)
-
 
 class TwoArmLogSettings(Settings):
     """Which file, which columns are whose, and whether a continuous log is reduced to its still moments.
@@ -156,8 +239,8 @@ class TwoArmLogReader:
         times = [] if s.time is None else [s.time]
         numbers = [*(column for arm in s.arms.values() for column in arm.from_base), *times]
         read, column_names, digest = _read_columns(path, s.delimiter, numbers, list(s.labels.values()))
-        ratios = np.concatenate([arm.ratios for arm in s.arms.values()])
-        joint_angles = np.array(read.numbers[: len(channels)]) / ratios[:, None]
+        ratios = [ratio for arm in s.arms.values() for ratio in arm.gear_ratios or (1.0,) * len(arm.columns)]
+        joint_angles = np.array(read.numbers[: len(channels)]) / np.array(ratios)[:, None]
         values = dict(zip(channels, joint_angles, strict=True))
         names = dict(zip(channels, column_names, strict=False))
         turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
