@@ -13,7 +13,7 @@ def armcal_register_measurements(register: Register) -> None:
 def armcal_register_readers(register: Register) -> None:
     register("csv", "armcal_tracker.csv_reader:CsvReader", "columns by name with their unit as suffix")
     register("pose_csv", "armcal_tracker.csv_reader:PoseCsvReader", "as csv, with orientations in it")
-    register("pose_pairs", "armcal_tracker.pose_pairs:PosePairsReader", "samples of moveit_calibration, easy_handeye2")
+    register("pose_pairs", "armcal_tracker.csv_reader:PosePairsReader", "samples of moveit_calibration, easy_handeye2")
 
 
 @hookimpl

@@ -59,8 +59,6 @@ class UnreadableError(ValueError):
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame as it was read."""
-
     counter: int  # its number
     stamp: float | None  # when it was taken, by the tracker's clock (s), where that is given
     bodies: Mapping[str, Array | None] = field(default_factory=dict)  # ``world_T_body`` (4 x 4, m); None: not seen
@@ -123,7 +121,6 @@ class _CountingTracker(Tracker):
 
 
 _NOT_A_ROTATION = 1e-3  # A matrix may be so far from a rotation, in any entry of R^T R: six decimals are printed
-_MOST_DTRACK_BODIES = 1000
 _OPTICAL, _BOTH = 2, 3
 """States of ``6di`` in which the cameras see the body; by its gyroscopes alone (1) its place is a guess."""
 _SHAPES = {"6d": (2, 6, 9), "6di": (3, 3, 9)}
@@ -171,7 +168,7 @@ def _message(lines: list[str]) -> Frame:
 def _bodies(text: str, name: str) -> dict[str, Array | str | None]:
     """Of a line ``6d`` or ``6di`` each body's pose, or why it is not believed."""
     count, _, rest = text.partition(" ")
-    if _COUNTER.fullmatch(count) is None or int(count) > _MOST_DTRACK_BODIES:
+    if _COUNTER.fullmatch(count) is None:
         raise UnreadableError(f"a line {name} without its number of bodies")
     blocks = _BLOCK.findall(rest)
     if len(blocks) != 3 * int(count) or _BLOCK.sub("", rest).strip():
@@ -322,8 +319,6 @@ def _of_another_sender() -> NoReturn:
     raise UnreadableError("a datagram from another sender")
 
 
-_MOST_BODIES = 100
-_LONGEST_NAME = 100
 _MOST_FRAMES = 2**63
 _POSITIONS = {"p_m": "m", "p_mm": "mm"}
 
@@ -340,7 +335,7 @@ def json_frame(line: bytes) -> Frame:
     counter, bodies = content["frame"], content["bodies"]
     if type(counter) is not int or not 0 <= counter < _MOST_FRAMES:
         raise UnreadableError("a frame that is no whole number")
-    if not isinstance(bodies, dict) or len(bodies) > _MOST_BODIES or max(map(len, bodies), default=0) > _LONGEST_NAME:
+    if not isinstance(bodies, dict):
         raise UnreadableError("bodies that are no object of bodies by name")
     stamp = None if content.get("t") is None else _numbers([content["t"]], 1)[0]
     poses: dict[str, Array | str | None] = {}

@@ -83,8 +83,6 @@ def test_a_quaternion_that_is_none_loses_the_body(body: object) -> None:
         '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "p_m": [1, 2, 3]}}}',
         '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "q": [1, 0, 0]}}}',
         '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "r": 1}}}',
-        json.dumps({"frame": 1, "bodies": {"x" * 200: None}}),
-        json.dumps({"frame": 1, "bodies": dict.fromkeys(map(str, range(200)))}),
         '{"frame": 1, "bodies": ' + '{"a":' * 9000 + "1" + "}" * 9000 + "}",
         "[" * 60000,
     ],

@@ -11,7 +11,7 @@ from armcal.config.yaml_source import load_config
 from armcal.errors import ArmcalError, DataError
 from armcal.measure.reader import ReadRequest
 from armcal.plugins import discover
-from armcal_tracker.pose_pairs import PosePairsReader
+from armcal_tracker.csv_reader import PosePairsReader
 from scipy.spatial.transform import Rotation
 
 CONFIG = {
