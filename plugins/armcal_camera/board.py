@@ -288,7 +288,6 @@ def require_distinct(boards: Sequence[Board]) -> None:
 
 
 def dictionary(family: str) -> Any:
-    """OpenCV's dictionary of a family of tags."""
     aruco = opencv().aruco
     return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_APRILTAG_{family}" if family in FAMILIES else family))
 

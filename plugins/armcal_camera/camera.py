@@ -260,7 +260,7 @@ class Camera(PointInstrument):
             "fy_px": 905,
             "cx_px": 640,
             "cy_px": 400,
-            "distortion": [-0.1, 0.01, 0.001, -0.001, 0.0],
+            "distortion": [-0.1, 0.01, 0.001, -0.001],
         },
         "pose": {"position_mm": [20, 0, 60], "rpy_deg": [5, -3, 90]},
         "board_poses": [{"position_mm": [300, 200, 2000], "rpy_deg": [10, 15, 0]}],

@@ -89,8 +89,6 @@ _NEAR = 1e-9
 
 
 class Refined(NamedTuple):
-    """Corners after the fit."""
-
     corners: Array  # (N x 2, px); NaN where the surroundings are not those of a corner
     blur: Array  # standard deviation of the blur across the edges (N, px)
     crossing: Array  # q3, whose sign says which quadrants are dark (N, grey values); NaN as well
@@ -282,8 +280,6 @@ _ASTRAY = 0.25
 
 @dataclass(frozen=True)
 class Detection:
-    """A board in an image."""
-
     corners: Array  # of each of the board's points (P x 2, px); NaN where it was not seen
     fault: str = ""  # why the image says nothing of this board; empty if it does
     blur: float = math.nan  # standard deviation of the blur across edges (px)

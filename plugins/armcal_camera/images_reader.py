@@ -62,8 +62,6 @@ class ImagesSettings(Settings):
 
 @dataclass(frozen=True)
 class View:
-    """What one image says."""
-
     corners: Array  # over all boards (K x 2, px)
     fault: str = ""  # why it says nothing
     size: tuple[int, int] | None = None
@@ -193,13 +191,11 @@ def _as_the_others(views: Mapping[str, View]) -> dict[str, View]:
 
     def judged(view: View) -> View:
         if usual and view.size and view.size != usual:
-            width, height = view.size
-            text = f"it is {width} x {height} px, the others are {usual[0]} x {usual[1]}"
-        elif not view.fault and view.blur > _BLURRED * blur:
+            return replace(view, fault="it is {} x {} px, the others are {} x {}".format(*view.size, *usual))
+        if not view.fault and view.blur > _BLURRED * blur:
             text = f"it is blurred: edges are {2 * view.blur:.1f} px wide, {2 * blur:.1f} px in most images"
-        else:
-            return view
-        return replace(view, fault=text)
+            return replace(view, fault=text)
+        return view
 
     return {name: judged(view) for name, view in views.items()}
 

@@ -24,6 +24,7 @@ Pixels: TypeAlias = Annotated[float, UnitOf("image")]
 DISTORTION = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 """Names of the distortion coefficients of each model, in OpenCV's order."""
 _STEPS = 40
+_STEEPEST = 20.0  # Of rays: beyond 87 deg from the axis no lens of these models says where they come from
 _NO_ANGLE = 1e-24
 _MOST_BYTES = 1024**2
 _FISHEYE = {"equidistant", "fisheye"}
@@ -140,4 +141,5 @@ def normalised(lens: str, image: Array, focal: Array, centre: Array, distortion:
     matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
     undistort = (opencv().fisheye if lens == "fisheye" else opencv()).undistortPoints
     places = np.asarray(image, dtype=float).reshape(-1, 1, 2)
-    return np.asarray(undistort(places, matrix, distortion, criteria=(3, _STEPS, 1e-15))).reshape(-1, 2)
+    rays = undistort(places, matrix, distortion, criteria=(3, _STEPS, 1e-15)).reshape(-1, 2)
+    return np.asarray(rays.clip(-_STEEPEST, _STEEPEST))

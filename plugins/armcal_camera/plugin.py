@@ -25,11 +25,7 @@ def armcal_register_measurements(register: Register) -> None:
 
 @hookimpl
 def armcal_register_cameras(register: Register) -> None:
-    register(
-        "opencv",
-        "armcal_camera.images_reader:LiveImages",
-        "a camera of OpenCV, or a folder that fills",
-    )
+    register("opencv", "armcal_camera.images_reader:LiveImages", "a camera of OpenCV, or a folder that fills")
 
 
 @hookimpl

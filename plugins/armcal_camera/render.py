@@ -32,7 +32,6 @@ class Lens:
     model: str = "pinhole"  # or fisheye
 
     def rays(self, pixels: Array) -> Array:
-        """x/z and y/z of the rays to pixels (N x 2)."""
         numbers = (np.array(part) for part in (self.focal, self.centre, self.distortion))
         return normalised(self.model, pixels, *numbers)
 

@@ -77,8 +77,6 @@ _TURNED_RAD = 0.02
 
 
 class HandEye(NamedTuple):
-    """A solution of A X = Y B."""
-
     x: Array  # 4 x 4 (m)
     y: Array
     left_m: float  # typical distance (median, m) between A X and Y B

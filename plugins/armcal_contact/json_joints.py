@@ -33,15 +33,11 @@ class _RefusedLine(ValueError):  # noqa: N818 (it is no error of a program's)
 
 
 class JsonLinesJointSettings(Settings):
-    """Where lines come from, and what their numbers are called.
-
-    Attributes:
-        joints: the source's own names by joint (``{j1: shoulder}``); joints that are not named have their own.
-    """
+    """Where lines come from, and what their numbers are called; joints that ``joints`` does not name have their own."""
 
     source: SourceName  # ``-`` (standard input), ``udp:PORT``, or a file that another program writes
     begin: Begin = "end"  # from where a file is read
-    joints: dict[str, str] = Field(default_factory=dict)
+    joints: dict[str, str] = Field(default_factory=dict)  # the source's own names (``{j1: shoulder}``)
     values: str | None = None  # the key of a list of all joints in order, where they have no names
     unit: Literal["rad", "deg", "mrad"] | None = None  # of numbers whose names do not end in one
     time: str = "time_s"  # the key of the source's own time, with its unit

@@ -16,13 +16,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import casadi as ca
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite, symmetric
-from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
@@ -80,10 +79,6 @@ class QuadraticModel(Posed):
         )
 
 
-def has_matrices(parameters: Parameters) -> bool:
-    return any(isinstance(block.domain, Semidefinite) for block in parameters.free)
-
-
 def approached(posed: PosedProblem, x: Array, solved: Callable[[Posed, Array], Array]) -> Array:
     """Where steps of quadratic models lead, damped where one does not hold [Nocedal2006]; ``solved`` minimises a model.
 
@@ -110,7 +105,6 @@ def approached(posed: PosedProblem, x: Array, solved: Callable[[Posed, Array], A
 
 
 def _model(posed: PosedProblem, x: Array) -> NormalEquations | None:
-    """By coordinates; None where the arm has no equilibrium."""
     try:
         return posed.convex_model(x)
     except NotConvergedError:
@@ -127,8 +121,6 @@ def definite(posed: PosedProblem, x: Array, least: float) -> Array:
             values[place] = lifted[np.triu_indices(3)]
     return np.asarray(np.clip(posed.x(values), *posed.bounds()))
 
-
-T = TypeVar("T")
 
 _SAME_COST = 1e-6
 _BARRIER_START = 1e-8
@@ -194,7 +186,7 @@ def _solve_once(settings: IpoptSettings, problem: Problem, start: Array) -> _Run
         iterations += 1
         return _searched(settings, model, x).x
 
-    if has_matrices(problem.parameters):
+    if any(isinstance(block.domain, Semidefinite) for block in problem.parameters.free):
         start = approached(posed, start, solved)
     run = _searched(settings, posed, start)
     return replace(run, iterations=run.iterations + iterations)
@@ -336,8 +328,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         super().__init__()
         self._function = getattr(objective, what)
         size = objective.size
-        self._shape = {"cost": (1, 1), "gradient": (size, 1), "hessian": (size, size)}[what]
-        self._size = size
+        self._size, self._shape = size, {"cost": (1, 1), "gradient": (size, 1), "hessian": (size, size)}[what]
         self.construct(what, {})
 
     @override

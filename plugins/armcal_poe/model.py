@@ -21,7 +21,6 @@ from armcal.base.se3 import Expression, Transform
 from armcal.base.settings import Angle, Length, Length3, Settings
 from pydantic import Field, field_validator, model_validator
 
-Vector = tuple[float, float, float]
 SHORTEST_AXIS = 1e-9
 
 
@@ -29,7 +28,7 @@ class _JointSettings(Settings):
     """What all joints have: a name, and the direction of their axis in the base frame at zero angles, of any length."""
 
     name: str | None = None
-    axis: Vector
+    axis: Vector3
 
     @field_validator("name")
     @classmethod
@@ -40,14 +39,14 @@ class _JointSettings(Settings):
 
     @field_validator("axis")
     @classmethod
-    def _unit(cls, axis: Vector) -> Vector:
+    def _unit(cls, axis: Vector3) -> Vector3:
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
             raise ValueError(f"found an axis of length {length:g}, expected a direction: [0, 0, 1]")
         return axis
 
     @property
-    def direction(self) -> Vector:
+    def direction(self) -> Vector3:
         x, y, z = np.array(self.axis) / np.linalg.norm(self.axis)
         return float(x), float(y), float(z)
 
@@ -85,7 +84,6 @@ class PoeSettings(Settings):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """As configured, else q1, q2, ..."""
         return tuple(joint.name or f"q{i}" for i, joint in enumerate(self.joints, start=1))
 
     @model_validator(mode="after")

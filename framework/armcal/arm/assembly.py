@@ -3,9 +3,8 @@
 Springs that share a site share its coordinates: their deflections add up.
 """
 
-import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -14,18 +13,9 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.effects import MOUNT, XYZ, Condition, JointCommand, JointEffect, Spring, check_springs
-from armcal.arm.model import ArmModel, Chain, Frames, Joint, Vector3, check_chain, forward
+from armcal.arm.model import ArmModel, Chain, Frames, Joint, Mimic, Vector3, check_chain, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
-from armcal.arm.statics import (
-    LOAD_CHANNELS,
-    Environment,
-    Load,
-    MassSpec,
-    SiteWrench,
-    effort,
-    joint_efforts,
-    wrenches,
-)
+from armcal.arm.statics import LOAD_CHANNELS, Environment, Load, MassSpec, SiteWrench, effort, joint_efforts, wrenches
 from armcal.base import se3
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
@@ -178,22 +168,16 @@ class Arm:
             joint: sum((factor * stated[other] for other, factor in self.couplings.get(joint, {}).items()), own)
             for joint, own in stated.items()
         }
-        return [
-            content[joint.name]
-            if joint.mimic is None
-            else joint.mimic.multiplier * content[joint.mimic.master] + joint.mimic.offset
-            for joint in self.nominal_chain.joints
-        ]
+        return self._followed(content, lambda mimic, master: mimic.multiplier * master + mimic.offset)
 
     def joint_approaches(self, approaches: Sequence[Any]) -> list[Any]:
         """From where every joint came (-1, 0, 1), from the ``commanded`` ones' approaches."""
         content = dict(zip(self.commanded, approaches, strict=True))
-        return [
-            content[joint.name]
-            if joint.mimic is None
-            else math.copysign(joint.mimic.multiplier != 0, joint.mimic.multiplier) * content[joint.mimic.master]
-            for joint in self.nominal_chain.joints
-        ]
+        return self._followed(content, lambda mimic, master: float(np.sign(mimic.multiplier)) * master)
+
+    def _followed(self, own: Mapping[str, Any], follow: Callable[[Mimic, Any], Any]) -> list[Any]:
+        joints = self.nominal_chain.joints
+        return [own[j.name] if j.mimic is None else follow(j.mimic, own[j.mimic.master]) for j in joints]
 
     @cached_property
     def command_channels(self) -> Mapping[str, str]:

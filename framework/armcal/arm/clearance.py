@@ -157,15 +157,11 @@ class ClearanceCheck:
     def __init__(self, arm: Arm, clearance: Clearance) -> None:
         self._clearance = clearance
         moved_by = joints_of_frames(arm)
-        self._pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
+        self.pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
         capsules = [shape for shapes in clearance.parts.values() for shape in shapes if isinstance(shape, _ROUND)]
         points = {point for capsule in capsules for point in (capsule.start, capsule.end)}
         self._points = [_TOOL, *sorted(points, key=repr)]
         self._function = _point_function(arm, self._points)
-
-    @property
-    def pairs(self) -> tuple[tuple[tuple[str, str], ...], ...]:
-        return tuple(self._pairs)
 
     def worst(self, pose: Array) -> str:
         """What is too near in a pose (joints; rad or m), and by how much; empty where nothing is."""
@@ -173,23 +169,22 @@ class ClearanceCheck:
         row = int(np.argmin(margins))
         if margins[row] >= 0:
             return ""
-        regions = row == len(self._pairs)
+        regions = row == len(self.pairs)
         what = "the tool and a forbidden region" if regions else " and ".join(self._clearance.rules[row].between)
         return f"{what} are {-1000 * margins[row]:.0f} mm too near"
 
     def __call__(self, joint_angles: Array) -> Checked:
-        """Check commands (joints x N; rad or m)."""
         starts = range(0, joint_angles.shape[1], _AT_ONCE)
         parts = [self._margins(joint_angles[:, start : start + _AT_ONCE]) for start in starts]
-        return Checked(np.concatenate(parts, axis=1) if parts else np.zeros((len(self._pairs) + 1, 0)))
+        return Checked(np.concatenate(parts, axis=1) if parts else np.zeros((len(self.pairs) + 1, 0)))
 
     def _margins(self, joint_angles: Array) -> Array:
         count = joint_angles.shape[1]
         stacked = np.asarray(self._function.map(count)(joint_angles).full()).T.reshape(count, -1, 3)
         where = {point: stacked[:, i] for i, point in enumerate(self._points)}
-        margins = np.full((len(self._pairs) + 1, count), np.inf)
+        margins = np.full((len(self.pairs) + 1, count), np.inf)
         known: dict[tuple[str, str], Array] = {}
-        for row, (rule, pairs) in enumerate(zip(self._clearance.rules, self._pairs, strict=True)):
+        for row, (rule, pairs) in enumerate(zip(self._clearance.rules, self.pairs, strict=True)):
             for pair in pairs:
                 if pair not in known:
                     known[pair] = self._apart(pair, where, count)

@@ -72,11 +72,7 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[MassSpec], load: Loa
     weight_at: dict[int, Expression] = defaultdict(lambda: ca.SX(0))
     moment_at: dict[int, Expression] = defaultdict(lambda: ca.SX(3, 1))
     mount, moved_by = frames.sites[0], frame_names(chain)
-    places = {
-        **frames.named,
-        MOUNT_FRAME: se3.Transform(mount.rotation, mount.origin),
-        TOOL_FRAME: frames.base_T_tool,
-    }
+    places = {**frames.named, MOUNT_FRAME: se3.Transform(mount.rotation, mount.origin), TOOL_FRAME: frames.base_T_tool}
     for mass in masses:
         up_to = moved_by[mass.frame] if mass.loads_up_to is None else mass.loads_up_to
         weight_at[up_to] += mass.mass

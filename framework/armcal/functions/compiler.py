@@ -144,10 +144,7 @@ def _forget_old(directory: Path) -> None:
 
 @cache
 def _compiler_identity() -> str:
-    compiler = find_compiler()
-    if compiler is None:
-        return ""
-    real = Path(compiler).resolve()
+    real = Path(find_compiler() or "").resolve()
     with suppress(OSError):
         seen = real.stat()
         return f"{real} {seen.st_size} {seen.st_mtime_ns}"
