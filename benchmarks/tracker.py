@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from armcal.devices.clock import RealClock
-from armcal_tracker.dtrack import DTrackSettings, DTrackTracker
+from armcal_tracker.trackers import DTrackSettings, DTrackTracker
 
 from benchmarks.report import Row
 from benchmarks.timing import best_times

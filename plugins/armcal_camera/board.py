@@ -1,7 +1,7 @@
 """Boards that a camera sees: which kind, its sizes, and where its points are.
 
 A board's frame lies in its printed face, x along its columns and y along its rows. Points are counted from 0, the
-columns first. Nothing here needs OpenCV.
+columns first. Only drawing their tags needs OpenCV.
 """
 
 import math
@@ -18,11 +18,10 @@ from armcal.base.config_text import resolve_path
 from armcal.base.settings import Length, Settings
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
-from armcal.errors import ArmcalError, ConfigError, Location
+from armcal.errors import ArmcalError, ConfigError, Location, PluginError
+from armcal.plugins import library
 from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import override
-
-from armcal_camera.images import opencv
 
 FAMILIES = MappingProxyType({"16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587})
 """AprilTag families and how many tags each has. [Olson2011]"""
@@ -31,6 +30,15 @@ _MOST = 200
 _Count = Annotated[int, Field(ge=1, le=_MOST)]
 _Size = Annotated[Length, Field(gt=0.0, le=100.0)]
 _Id = Annotated[int, Field(ge=0)]
+
+
+def opencv() -> Any:
+    cv2 = library("cv2", "a camera")
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
+        version = getattr(cv2, "__version__", "of an unknown version")
+        hint = "Run pip install --upgrade 'armcal[camera]'."
+        raise PluginError(f"found OpenCV {version}, expected at least 4.8.", hint=hint)
+    return cv2
 
 
 def tags_in(family: str) -> int:
@@ -63,7 +71,6 @@ class Board(Settings):
 
     @property
     def layout(self) -> Layout:
-        """What is printed of it."""
         raise NotImplementedError
 
     @model_validator(mode="after")
@@ -77,7 +84,6 @@ class Board(Settings):
 
     @property
     def points(self) -> Array:
-        """Where its points are (P x 3, m)."""
         return self.layout.points
 
     @property
@@ -208,7 +214,6 @@ _UPWARDS = ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 def _grid(columns: int, rows: int, step: float) -> Array:
-    """Points of a grid, row by row (N x 3)."""
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
     return np.stack([step * x.ravel(), step * y.ravel(), np.zeros(x.size)], axis=1)
 
@@ -239,9 +244,7 @@ def or_file(read: Callable[[Path], Settings]) -> BeforeValidator:
 
 
 AnyBoard: TypeAlias = Annotated[Chessboard | Charuco | Aprilgrid | Tag, Field(discriminator="type")]
-"""A field of settings that is a board."""
 BoardOrFile: TypeAlias = Annotated[AnyBoard, or_file(lambda path: read_board(path))]
-"""A field of settings that is a board, or the path of a file of one; relative to the configuration it stands in."""
 
 
 class BoardFile(Settings):
@@ -281,7 +284,6 @@ def read_board(path: Any) -> Board:
 
 
 def require_distinct(boards: Sequence[Board]) -> None:
-    """Refuse boards of one measurement that cannot be distinguished in an image."""
     for index, board in enumerate(boards):
         for other in boards[:index]:
             own, others = board.layout, other.layout
@@ -290,20 +292,25 @@ def require_distinct(boards: Sequence[Board]) -> None:
                 tags = f"the tag {min(shared)} of {own.tag_family}"
                 raise ValueError(f"two boards have {tags}: give each its own ids, by first_id or id")
             if isinstance(board, Chessboard) and isinstance(other, Chessboard):
-                same = {board.columns, board.rows} == {other.columns, other.rows}
-                if same:
+                is_same = {board.columns, board.rows} == {other.columns, other.rows}
+                if is_same:
                     raise ValueError("two chessboards of the same size look alike: use ChArUco boards")
 
 
 def dictionary(family: str) -> Any:
-    """OpenCV's dictionary of a family of tags."""
     aruco = opencv().aruco
     return aruco.getPredefinedDictionary(getattr(aruco, f"DICT_APRILTAG_{family}" if family in FAMILIES else family))
 
 
 def dark_rectangles(board: Board) -> Array:
     """The dark parts, in the board's frame (N x 4: smallest x and y, largest x and y; m)."""
-    parts = [_squares(board), *_tags(board)]
+    parts = _tags(board)
+    if isinstance(board, Chessboard | Charuco):
+        is_chessboard = isinstance(board, Chessboard)
+        columns, rows = board.columns + is_chessboard, board.rows + is_chessboard
+        odd = 0 if isinstance(board, Chessboard) or not board.legacy else 1 - rows % 2
+        dark = np.array([(i, j) for j in range(rows) for i in range(columns) if (i + j) % 2 == odd])
+        parts.insert(0, board.square * np.hstack([dark - 1, dark]))
     ends = np.concatenate(parts)
     return np.hstack([np.minimum(ends[:, :2], ends[:, 2:]), np.maximum(ends[:, :2], ends[:, 2:])])
 
@@ -314,16 +321,6 @@ def outline(board: Board) -> Array:
     if isinstance(board, Chessboard | Charuco):
         low = np.array([-board.square, -board.square])
     return np.array([*low, *(low + board.layout.extent)])
-
-
-def _squares(board: Board) -> Array:
-    if not isinstance(board, Chessboard | Charuco):
-        return np.zeros((0, 4))
-    is_chessboard = isinstance(board, Chessboard)
-    columns, rows = board.columns + is_chessboard, board.rows + is_chessboard
-    odd = 0 if isinstance(board, Chessboard) or not board.legacy else 1 - rows % 2
-    dark = np.array([(i, j) for j in range(rows) for i in range(columns) if (i + j) % 2 == odd])
-    return np.asarray(board.square * np.hstack([dark - 1, dark]))
 
 
 def _tags(board: Board) -> list[Array]:

@@ -132,10 +132,9 @@ def _fill(axes: Any, rectangles: Array) -> None:
     """Black rectangles (N x 2 x 2: ends x, y; mm), as one path: no seam between neighbours."""
     paths, patches = (library(f"matplotlib.{name}", "printing a board") for name in ("path", "patches"))
     (left, top), (right, bottom) = rectangles[:, 0].T, rectangles[:, 1].T
-    x, y = (left, right, right, left, left), (top, top, bottom, bottom, top)
-    codes = np.tile([1, 2, 2, 2, 79], len(rectangles))  # move, line, line, line, close
-    corners = np.stack([np.stack(x, axis=1), np.stack(y, axis=1)], axis=2).reshape(-1, 2)
-    axes.add_patch(patches.PathPatch(paths.Path(corners, codes), facecolor="black", linewidth=0))
+    corners = np.array([(left, right, right, left), (top, top, bottom, bottom)]).transpose(2, 1, 0)
+    path = paths.Path.make_compound_path_from_polys(corners)
+    axes.add_patch(patches.PathPatch(path, facecolor="black", linewidth=0))
 
 
 def page_of(board: Board, paper: str) -> tuple[float, float]:

@@ -21,15 +21,7 @@ from armcal.measure.measurement import Channel, Mistake
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct
-from armcal_camera.intrinsics import (
-    DISTORTION,
-    IntrinsicsOrFile,
-    Lens,
-    Pixels,
-    normalised,
-    other_size,
-    projected,
-)
+from armcal_camera.intrinsics import DISTORTION, IntrinsicsOrFile, Lens, Pixels, normalised, other_size, projected
 from armcal_camera.render import rendered_records
 from armcal_camera.start import (
     FEWEST_POINTS,
@@ -48,23 +40,20 @@ _FEWEST_VIEWS, _MOST_VIEWS = 3, 30
 
 
 class _View(NamedTuple):
-    """A board in a record: its points (n x 2, m) and where they appear (n x 2, thousands of pixels)."""
+    """A board in a record."""
 
     record: int
     board: int
-    points: Array
-    image: Array
+    points: Array  # on the board (n x 2, m)
+    image: Array  # where they appear (n x 2, thousands of pixels)
 
 
 def first_guess(camera: Camera, reading: Reading) -> Proposal:
-    """Free parameters of a camera from what it saw; the others are held. See ``Proposing.propose``.
+    """Free parameters of a camera from what it saw; the others are fixed. See ``Proposing.propose``.
 
     With A the frame of the camera as seen from that of the boards, A camera_pose = board_pose camera_T_board^-1 in
-    every record: one equation wherever camera and boards are. Boards whose place is held or another camera's do where
+    every record: one equation wherever camera and boards are. Boards whose place is fixed or another camera's do where
     the motion leaves it open.
-
-    Raises:
-        ProblemError: the images cannot be of what is stated.
     """
     own, free = dict(reading.values), reading.free
     views = _views(camera, reading)
@@ -127,7 +116,6 @@ def _placed(name: str, free: frozenset[str]) -> bool:
 
 
 def _views(camera: Camera, reading: Reading) -> list[_View]:
-    """Every board in every record of which enough points are there."""
     scale = float(reading.values["board_scale"][0])
     image = np.array(list(reading.channels.values())).reshape(len(camera.points), 2, -1)
     views, start = [], 0
@@ -171,7 +159,7 @@ def _poses(camera: Camera, views: list[_View], values: Mapping[str, Array]) -> l
     distortion = np.concatenate([values[name] for name in DISTORTION[lens]])
     poses: list[dict[int, Array]] = [{} for _ in camera.boards]
     for view in _fullest(views):
-        seen = normalised(lens, view.image.T, focal, centre, distortion).T
+        seen = normalised(lens, view.image, focal, centre, distortion)
         poses[view.board][view.record] = board_pose(view.points, seen)
     return poses
 
@@ -272,7 +260,7 @@ class Camera(PointInstrument):
             "fy_px": 905,
             "cx_px": 640,
             "cy_px": 400,
-            "distortion": [-0.1, 0.01, 0.001, -0.001, 0.0],
+            "distortion": [-0.1, 0.01, 0.001, -0.001],
         },
         "pose": {"position_mm": [20, 0, 60], "rpy_deg": [5, -3, 90]},
         "board_poses": [{"position_mm": [300, 200, 2000], "rpy_deg": [10, 15, 0]}],
@@ -455,5 +443,4 @@ class Camera(PointInstrument):
         return rendered_records(self, frames, values)
 
     def propose(self, reading: Reading) -> Proposal:
-        """Where a fit may start, from the images alone; see ``Proposing``."""
         return first_guess(self, reading)

@@ -1,4 +1,4 @@
-"""Boards in images: found on a reduced image, refined on the full one.
+"""Boards in images: grey values of image files; boards found on a reduced image, refined on the full one.
 
 OpenCV says about where the corners are, ``armcal_camera.detection`` where exactly; so the corners hardly depend on its
 version. A chessboard must be seen whole, as nothing else says which of its corners is which; of boards with tags a
@@ -15,14 +15,67 @@ it is more accurate than a point's gradient, and its width says how sharp the im
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from io import BytesIO
 from typing import Any, NamedTuple
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from armcal.base.arrays import Array
+from armcal.errors import DataError, Location
+from armcal.plugins import library
+from numpy.typing import NDArray
 from scipy.special import erf
 
-from armcal_camera.board import FAMILIES, Aprilgrid, Board, Charuco, Chessboard, dictionary
-from armcal_camera.images import Grey, opencv
+from armcal_camera.board import FAMILIES, Aprilgrid, Board, Charuco, Chessboard, dictionary, opencv
+
+Grey = NDArray[np.uint8]  # An image (H x W); the centre of the pixel in column u and row v is at (u, v)
+
+_ENDS = ((b"\x89PNG", b"IEND", 64), (b"\xff\xd8", b"\xff\xd9", 4096))
+_KINDS = ("PNG", "JPEG", "TIFF", "BMP", "DIB", "WEBP", "PPM")
+_FEWEST_PIXELS, MOST_PIXELS = 1024, 100_000_000
+MOST_BYTES = 512 * 1024**2  # Of an image file
+
+
+def grey_image(content: bytes, source: str) -> Grey:
+    """The grey values of an image file, as the sensor has them: an orientation that it states is not applied.
+
+    Of more than 8 bits a pixel the brightest hundredth of the image becomes 255, so that a few dazzling pixels do not
+    darken the rest. An image that is too large is refused by its header, before anything is decoded.
+    """
+    cv2 = opencv()
+    pixels = _stated_pixels(content)
+    if pixels > MOST_PIXELS:
+        message = f"found an image of more than {MOST_PIXELS / 1e6:g} million pixels, expected at most so many."
+        raise DataError(message, where=Location(source), hint="Save it with fewer pixels, or remove it.")
+    cut = any(content.startswith(head) and tail not in content[-last:] for head, tail, last in _ENDS)
+    image = None
+    if pixels and not cut:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        except cv2.error:  # what it does not know it refuses in many ways
+            image = None
+    if image is None or image.size < _FEWEST_PIXELS:
+        message = "the image is cut off." if cut else "it is not an image that can be read."
+        raise DataError(message, where=Location(source), hint="Save it as PNG again, or remove it.")
+    if image.dtype != np.uint8:
+        image = np.rint(np.nan_to_num(image) * (255.0 / max(float(np.percentile(image, 99)), 1e-9))).clip(0, 255)
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def _stated_pixels(content: bytes) -> float:
+    """How many pixels the header of an image file states; 0 where there is no header of a kind that is read."""
+    pillow = library("PIL.Image", "looking at images")
+    with catch_warnings():
+        simplefilter("ignore")
+        try:
+            with pillow.open(BytesIO(content), formats=_KINDS) as header:
+                return float(header.width * header.height)
+        except pillow.DecompressionBombError:
+            return np.inf
+        except Exception:  # broken headers are refused in many ways
+            return 0.0
+
 
 _AT_ONCE = 8  # corners: their pixels stay in the processor's cache
 _LARGEST = 20
@@ -36,8 +89,6 @@ _NEAR = 1e-9
 
 
 class Refined(NamedTuple):
-    """Corners after the fit."""
-
     corners: Array  # (N x 2, px); NaN where the surroundings are not those of a corner
     blur: Array  # standard deviation of the blur across the edges (N, px)
     crossing: Array  # q3, whose sign says which quadrants are dark (N, grey values); NaN as well
@@ -229,8 +280,6 @@ _ASTRAY = 0.25
 
 @dataclass(frozen=True)
 class Detection:
-    """A board in an image."""
-
     corners: Array  # of each of the board's points (P x 2, px); NaN where it was not seen
     fault: str = ""  # why the image says nothing of this board; empty if it does
     blur: float = math.nan  # standard deviation of the blur across edges (px)
@@ -302,12 +351,18 @@ def _other_board(image: Grey, nothing: Detection) -> Detection:
 
 
 def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detection:
-    seen, places, is_double = _seen_tags(reduced, board)
-    if not len(seen):
+    layout = board.layout
+    corners_of, ids = _detected(reduced, layout.tag_family, getattr(board, "border_bits", 1))
+    ours = [(i, corners) for i, corners in zip(ids, corners_of, strict=True) if i in layout.tag_ids]
+    numbers = [i for i, _ in ours]
+    if not ours:
         return _other_tags(reduced, board, nothing)
-    if is_double:
-        return replace(nothing, fault=f"the tag {is_double[0]} was found {is_double[1]} times")
-    known, pixels = board.tag_corners[seen, :, :2], _enlarged(places, reduced, image).reshape(-1, 4, 2)
+    double = next((i for i in numbers if numbers.count(i) > 1), None)
+    if double is not None:
+        return replace(nothing, fault=f"the tag {double} was found {numbers.count(double)} times")
+    seen = [layout.tag_ids.index(i) for i in numbers]
+    known = board.tag_corners[seen, :, :2]
+    pixels = _enlarged([corners for _, corners in ours], reduced, image).reshape(-1, 4, 2)
     others: list[tuple[Charuco | Aprilgrid, str]] = []
     if isinstance(board, Charuco) and board.rows % 2 == 0:
         text = f"its tags stand as on a board with legacy: {str(not board.legacy).lower()}"
@@ -328,15 +383,15 @@ def _tags(image: Grey, reduced: Grey, board: Board, nothing: Detection) -> Detec
         return replace(nothing, fault=f"{text}: check its columns, rows, spacing and first_id")
     corners_known, points = known.reshape(-1, 2), board.points[:, :2]
     away = np.linalg.norm(points[:, None] - corners_known[None], axis=2).min(axis=1)
-    near = np.flatnonzero(away < (0.99 * board.layout.step if isinstance(board, Charuco) else 1e-9))
+    near = np.flatnonzero(away < (0.99 * layout.step if isinstance(board, Charuco) else 1e-9))
     rough, scale = local_map(corners_known, pixels.reshape(-1, 2), points[near])
-    fit = refine(image, rough, scale, board.layout.reach)
+    fit = refine(image, rough, scale, layout.reach)
     corners = nothing.corners.copy()
     corners[near] = fit.corners
     there = points[np.isfinite(corners[:, 0])]
     count = len(there)
     # in a line they do not say how the board lies
-    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * board.layout.step:
+    if count < _FEWEST or np.linalg.svd(there - there.mean(axis=0), compute_uv=False)[1] < 0.5 * layout.step:
         return replace(nothing, fault=f"too few corners of the {board.kind} were found ({count} of {len(points)})")
     return replace(nothing, corners=corners, fault="", blur=float(np.nanmedian(fit.blur)))
 
@@ -371,17 +426,6 @@ def _detected(reduced: Grey, family: str, border_bits: int) -> tuple[Any, list[i
     parameters.markerBorderBits = border_bits
     corners, ids, _ = aruco.ArucoDetector(dictionary(family), parameters).detectMarkers(reduced)
     return corners, [] if ids is None else [int(i) for i in ids.ravel()]
-
-
-def _seen_tags(reduced: Grey, board: Board) -> tuple[list[int], Array, tuple[int, int] | None]:
-    """Which of the board's tags are seen (T), their corners (T x 4 x 2, px), and an id that stands there twice."""
-    layout = board.layout
-    corners, ids = _detected(reduced, layout.tag_family, getattr(board, "border_bits", 1))
-    ours = [(i, c) for i, c in zip(ids, corners, strict=True) if i in layout.tag_ids]
-    numbers = [i for i, _ in ours]
-    double = next(((i, numbers.count(i)) for i in numbers if numbers.count(i) > 1), None)
-    places = np.array([c.reshape(4, 2) for _, c in ours]).reshape(-1, 4, 2)
-    return [layout.tag_ids.index(i) for i in numbers], places, double
 
 
 def _turned(known: Array, pixels: Array) -> tuple[Array, float]:

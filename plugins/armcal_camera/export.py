@@ -1,7 +1,9 @@
-"""Calibrated cameras in the formats of others: ROS ``camera_info``, OpenCV's YAML, and where the camera sits."""
+"""Calibrated cameras in the formats of ROS, OpenCV and easy_handeye; and what the report of a run shows of them."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import yaml
@@ -10,13 +12,17 @@ from armcal.base.arrays import Array
 from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, Instrument
 from armcal.errors import ConfigError
+from armcal.report.document import Figure, Marks, Panel, Part, ReportSection, Table
+from armcal.report.numbers import significant
+from armcal.report.page import nice_step
+from armcal.run.result import RunResult
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.camera import Camera, CameraSettings
-from armcal_camera.images import opencv
-from armcal_camera.intrinsics import DISTORTION
+if TYPE_CHECKING:  # importing it takes 0.1 s, which a run without a camera must not wait for
+    from armcal_camera.camera import Camera
 
 _PX = 1000.0
+_MOST_VECTORS, _WORST = 4000, 8
 _MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
 
 
@@ -46,11 +52,8 @@ class _CameraExporter:
         self._settings = settings
 
     def _camera(self, request: ExportRequest) -> tuple[str, Instrument, Camera]:
-        """The camera that is meant: its name, its numbers, and what its settings make of it.
+        from armcal_camera.camera import Camera, CameraSettings
 
-        Raises:
-            ConfigError: there is none, or several and none is named.
-        """
         cameras = {name: i for name, i in request.instruments.items() if i.settings.get("type") == "camera"}
         chosen = self._settings.camera or (next(iter(cameras)) if len(cameras) == 1 else None)
         if chosen not in cameras:
@@ -68,11 +71,6 @@ class CameraInfoExporter(_CameraExporter):
     """The exporter ``camera_info``: the YAML of ROS's ``camera_info_manager``."""
 
     def export(self, request: ExportRequest) -> Exported:
-        """Width, height, matrix, distortion; rectification is the identity.
-
-        Raises:
-            ConfigError: no such camera, or its image size is not stated.
-        """
         name, instrument, camera = self._camera(request)
         matrix, distortion, size = _intrinsics(instrument, camera)
         if size is None:
@@ -99,11 +97,9 @@ class OpenCvExporter(_CameraExporter):
     """The exporter ``opencv``: YAML that ``cv::FileStorage`` reads."""
 
     def export(self, request: ExportRequest) -> Exported:
-        """``camera_matrix``, ``distortion_coefficients``, and the poses of camera and boards as 4 x 4 matrices (m).
+        """``camera_matrix``, ``distortion_coefficients``, and the poses of camera and boards as 4 x 4 matrices (m)."""
+        from armcal_camera.board import opencv
 
-        Raises:
-            ConfigError: no such camera.
-        """
         _, instrument, camera = self._camera(request)
         matrix, distortion, size = _intrinsics(instrument, camera)
         cv2 = opencv()
@@ -127,11 +123,6 @@ class HandEyeExporter(_CameraExporter):
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"tool_frame": "tool0"}
 
     def export(self, request: ExportRequest) -> Exported:
-        """The pose of the camera on the hand, or in the world, as translation (m) and quaternion; with its deviations.
-
-        Raises:
-            ConfigError: no such camera.
-        """
         name, instrument, camera = self._camera(request)
         on_hand = camera.camera_frame != BASE_FRAME
         carrier = camera.camera_frame if on_hand else camera.board_frame
@@ -174,6 +165,8 @@ class HandEyeExporter(_CameraExporter):
 
 def _intrinsics(instrument: Instrument, camera: Camera) -> tuple[Array, list[float], tuple[int, int] | None]:
     """Camera matrix (px), distortion coefficients, and width and height (px) where they are stated."""
+    from armcal_camera.intrinsics import DISTORTION
+
     n = instrument.numbers
     matrix = np.array([[_PX * n["fx"], 0, _PX * n["cx"]], [0, _PX * n["fy"], _PX * n["cy"]], [0, 0, 1.0]])
     size = camera.image and (round(_PX * camera.image[0]), round(_PX * camera.image[1]))
@@ -194,3 +187,43 @@ def _urdf_joint(parent: str, child: str, pose: Array) -> str:
         f'<joint name="{child}_joint" type="fixed">\n  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
         f'  <origin xyz="{place}" rpy="{turn}"/>\n</joint>\n'
     )
+
+
+def cameras(result: RunResult) -> ReportSection | None:
+    described = result.system.description["measurements"]
+    start, parts = 0, list[Part]()
+    for name, measurement in result.system.measurements.items():
+        rows = len(measurement.noise())
+        if described[name]["type"] == "camera":
+            camera, residual = cast("Camera", measurement), result.errors.calibrated_residual_mm[start : start + rows]
+            shape = (len(camera.points), 2, len(result.dataset))
+            seen = result.dataset.stacked([f"{name}.{channel.name}" for channel in camera.channels()])
+            # Where it saw corners, and measured minus predicted (2 x P x N each, px); NaN of those not seen
+            places, off = (numbers.reshape(shape).transpose(1, 0, 2) for numbers in (_PX * seen, residual))
+            off = np.where(np.isfinite(places).all(axis=0), off, np.nan)
+            count = np.isfinite(off[0]).sum(axis=0)
+            errors = np.sqrt(np.nansum(off**2, axis=(0, 1)) / np.maximum(count, 1))
+            order = [int(i) for i in np.argsort(-errors)[:_WORST] if count[i]]
+            worst = [(result.dataset.ids[i], significant(float(errors[i])), str(count[i])) for i in order]
+            title = f"{name}: the images with the largest errors"
+            parts += [_over_the_sensor(name, places, off), Table(title, ("Image", "rms, px", "Corners"), worst)]
+        start += rows
+    return ReportSection("Cameras", parts=parts) if parts else None
+
+
+def _over_the_sensor(name: str, places: Array, off: Array) -> Figure:
+    there = np.isfinite(off).all(axis=0)
+    places, off = places[:, there], off[:, there]
+    step = max(1, places.shape[1] // _MOST_VECTORS)
+    places, off = places[:, ::step], off[:, ::step]
+    typical = float(np.median(np.linalg.norm(off, axis=0)))
+    enlarged = nice_step(0.02 * float(np.ptp(places, axis=1).max()) / max(typical, 1e-9))
+    caption = (
+        f"Where corners were seen, all images together; lines are measured minus predicted, "
+        f"{significant(enlarged, 1)} times enlarged (median {significant(typical)} px). Lines of neighbours that agree "
+        "mean that the lens differs from its model; all lines of an image alike, that the arm stood elsewhere."
+    )
+    lines = np.stack([places, places + enlarged * off, np.full(places.shape, np.nan)], axis=2).reshape(2, -1)
+    marks = [Marks("vector", lines), Marks("dot small", places)]
+    panel = Panel("", marks, "u, px", "v, px", equal=True, down=True)
+    return Figure(f"{name}: reprojection residuals over the sensor", caption, caption, [panel], columns=1)

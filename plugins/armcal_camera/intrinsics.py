@@ -19,7 +19,7 @@ from armcal.base.settings import Settings, UnitOf
 from armcal.io.plain_files import input_bytes, refuse
 from pydantic import Field
 
-from armcal_camera.board import or_file
+from armcal_camera.board import opencv, or_file
 
 Lens: TypeAlias = Literal["pinhole", "fisheye"]
 Pixels: TypeAlias = Annotated[float, UnitOf("image")]
@@ -27,6 +27,7 @@ DISTORTION = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2",
 """Names of the distortion coefficients of each model, in OpenCV's order."""
 _NUMBER = re.compile(r"[-+.0-9eE]+")
 _STEPS = 40
+_STEEPEST = 20.0  # Of rays: beyond 87 deg from the axis no lens of these models says where they come from
 _NO_ANGLE = 1e-24
 _MOST_BYTES = 1024**2
 _FISHEYE = {"equidistant", "fisheye"}
@@ -56,11 +57,6 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.const
 
 
 def read_intrinsics(path: str | Path) -> IntrinsicsSettings:
-    """The intrinsics of a file.
-
-    Raises:
-        DataError: it is none of the three, or states another distortion model than these have.
-    """
     text = input_bytes(Path(path), _MOST_BYTES, "a file of intrinsics").decode("utf-8", "replace")
     try:
         lines = "\n".join(line for line in text.splitlines() if not line.startswith("%YAML"))
@@ -138,7 +134,6 @@ def _numbers(value: Any) -> list[float]:
 
 
 IntrinsicsOrFile: TypeAlias = Annotated[IntrinsicsSettings, or_file(read_intrinsics)]
-"""A field of settings with intrinsics, or the path of a file of them; relative to the configuration it stands in."""
 
 
 def pinhole(x: Any, y: Any, distortion: Any) -> tuple[Any, Any]:
@@ -167,16 +162,9 @@ def projected(lens: str, point: Any, focal: Any, centre: Any, distortion: Any) -
 
 
 def normalised(lens: str, image: Array, focal: Array, centre: Array, distortion: Array) -> Array:
-    """Undistorted x / z and y / z (2 x N) of places in an image (2 x N), by fixed-point iteration."""
-    seen = (image - centre[:, None]) / focal[:, None]
-    if lens == "fisheye":
-        turned = np.hypot(*seen)
-        angle = turned.copy()
-        for _ in range(_STEPS):
-            t2 = angle * angle
-            angle = turned / (1 + t2 * np.polyval(distortion[::-1], t2))
-        return np.asarray(seen * np.tan(np.clip(angle, 0.0, 1.5)) / np.maximum(turned, 1e-12))
-    here = seen.copy()
-    for _ in range(_STEPS):
-        here = np.asarray(here + (seen - np.array(pinhole(here[0], here[1], distortion))))
-    return here
+    """Undistorted x / z and y / z (N x 2) of places in an image (N x 2)."""
+    matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    undistort = (opencv().fisheye if lens == "fisheye" else opencv()).undistortPoints
+    places = np.asarray(image, dtype=float).reshape(-1, 1, 2)
+    rays = undistort(places, matrix, distortion, criteria=(3, _STEPS, 1e-15)).reshape(-1, 2)
+    return np.asarray(rays.clip(-_STEEPEST, _STEEPEST))

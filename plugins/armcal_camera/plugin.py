@@ -25,7 +25,7 @@ def armcal_register_measurements(register: Register) -> None:
 
 @hookimpl
 def armcal_register_cameras(register: Register) -> None:
-    register("opencv", "armcal_camera.live:Camera", "a camera of OpenCV, or a folder to which images come one by one")
+    register("opencv", "armcal_camera.images_reader:LiveImages", "a camera of OpenCV, or a folder that fills")
 
 
 @hookimpl
@@ -37,4 +37,4 @@ def armcal_register_exporters(register: Register) -> None:
 
 @hookimpl
 def armcal_register_report_sections(register: Register) -> None:
-    register("cameras", "armcal_camera.report:cameras", "reprojection residuals over the sensor and by image")
+    register("cameras", "armcal_camera.export:cameras", "reprojection residuals over the sensor and by image")

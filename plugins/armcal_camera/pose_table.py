@@ -1,7 +1,5 @@
 """Where the arm stood for each image: joint angles, or poses of the flange, from a file.
 
-Arms of which only poses were recorded: the pose alone as a model, or joint angles by a nominal model.
-
 Hand-eye calibration needs no more than the flange's pose. It is that of a chain of three sliding joints and three
 turning ones, so all that works for arms works for it; what its controller gets wrong is noise or an effect of these.
 
@@ -63,7 +61,6 @@ class FlangePose:
         self._settings = settings
 
     def parameters(self) -> Sequence[ParameterBlock]:
-        """None: what is recorded is the pose."""
         return ()
 
     def chain(self, values: Mapping[str, Any]) -> Chain:
@@ -164,10 +161,6 @@ def read_poses(
 
     Of an arm with joints, poses are those of its nominal tool, and give its joint angles (``recovered_joints``);
     ``first`` says about where these are in the first pose, by name (rad or m).
-
-    Raises:
-        DataError: with file, line and column.
-        PluginError: the reader is not known.
     """
     channels = tuple(w for w in request.channels if w.channel.partition(".")[0] not in cameras)
     rates = [w for w in channels if w.dimension == JOINT_RATE and (w.required or w.is_evidence)]
@@ -243,7 +236,6 @@ def _refuse_angles_of_pose(path: Path, header: Sequence[str], arm: Arm) -> None:
 
 
 def _flange_poses(reader: Any, arm: Arm, first: Mapping[str, float], request: ReadRequest) -> Dataset:
-    """What a reader of poses makes of the file, as joints."""
     reading: Any = _FlangeReading()
     others = tuple(w for w in request.channels if not w.channel.startswith(f"{arm.name}."))
     own = tuple(

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.errors import ConfigError
-from numpy.typing import NDArray
 
-from armcal_camera.board import Board, dark_rectangles, outline
-from armcal_camera.images import Grey, opencv
+from armcal_camera.board import Board, dark_rectangles, opencv, outline
+from armcal_camera.detection import Grey
 from armcal_camera.intrinsics import DISTORTION, normalised
 from armcal_camera.start import pose_matrix
 
@@ -33,9 +32,8 @@ class Lens:
     model: str = "pinhole"  # or fisheye
 
     def rays(self, pixels: Array) -> Array:
-        """x/z and y/z of the rays to pixels (N x 2)."""
         numbers = (np.array(part) for part in (self.focal, self.centre, self.distortion))
-        return normalised(self.model, pixels.T, *numbers).T
+        return normalised(self.model, pixels, *numbers)
 
 
 @dataclass(frozen=True)
@@ -57,12 +55,22 @@ def render(placed: Sequence[tuple[Board, Array]], lens: Lens, size: tuple[int, i
     rays = _fine_rays(lens, size)
     fine = np.full(rays.shape[:2], exposure.background, np.float32)
     for board, pose in placed:
-        texels = _texels_per_metre(board, lens, pose)
+        low, high = outline(board).reshape(2, 2)
+        corners = np.array([(x, y, 0.0, 1.0) for x in (low[0], high[0]) for y in (low[1], high[1])])
+        nearest, step = float((corners @ pose.T)[:, 2].min()), board.layout.step
+        if nearest <= 0:
+            raise ValueError("the board is not all in front of the camera")
+        # two texels a pixel where the board is nearest
+        texels = min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.layout.extent) + step))
+        width, height = (math.ceil((extent + step) * texels) for extent in board.layout.extent)
+        darkness, start = np.zeros((height, width), np.float32), low - step / 2
+        for x0, y0, x1, y1 in (dark_rectangles(board) - [*start, *start]) * texels:
+            (columns, across), (rows, along) = _coverage(x0, x1), _coverage(y0, y1)
+            darkness[rows, columns] += np.outer(along, across).astype(np.float32)
         plane = pose[:3, [0, 1, 3]]
-        start = outline(board)[:2] - board.layout.step / 2
         to_texel = np.array([[texels, 0, -texels * start[0] - 0.5], [0, texels, -texels * start[1] - 0.5], [0, 0, 1.0]])
         places = cv2.perspectiveTransform(rays, to_texel @ np.linalg.inv(plane))
-        texture = exposure.white + (exposure.dark - exposure.white) * _darkness(board, start, texels)
+        texture = exposure.white + (exposure.dark - exposure.white) * darkness
         cv2.remap(
             texture.astype(np.float32), places, None, cv2.INTER_LINEAR, dst=fine, borderMode=cv2.BORDER_TRANSPARENT
         )
@@ -87,25 +95,6 @@ def _fine_rays(lens: Lens, size: tuple[int, int]) -> Array:
     return np.ascontiguousarray(fine[cut : cut + size[1] * _SAMPLES, cut : cut + size[0] * _SAMPLES])
 
 
-def _texels_per_metre(board: Board, lens: Lens, pose: Array) -> float:
-    """Two texels a pixel where the board is nearest."""
-    low, high = outline(board).reshape(2, 2)
-    corners = np.array([(x, y, 0.0, 1.0) for x in (low[0], high[0]) for y in (low[1], high[1])])
-    nearest = float((corners @ pose.T)[:, 2].min())
-    if nearest <= 0:
-        raise ValueError("the board is not all in front of the camera")
-    return min(2 * max(lens.focal) / nearest, _MOST_TEXELS / (max(board.layout.extent) + board.layout.step))
-
-
-def _darkness(board: Board, start: Array, texels: float) -> NDArray[np.float32]:
-    width, height = (math.ceil((extent + board.layout.step) * texels) for extent in board.layout.extent)
-    texture = np.zeros((height, width), np.float32)
-    for x0, y0, x1, y1 in (dark_rectangles(board) - [*start, *start]) * texels:
-        (columns, across), (rows, along) = _coverage(x0, x1), _coverage(y0, y1)
-        texture[rows, columns] += np.outer(along, across).astype(np.float32)
-    return texture
-
-
 def _coverage(low: float, high: float) -> tuple[slice, Array]:
     texels = np.arange(math.floor(low), math.ceil(high))
     return slice(texels[0], texels[-1] + 1), np.minimum(texels + 1, high) - np.maximum(texels, low)
@@ -115,11 +104,7 @@ _USUAL = Exposure(blur=0.7, noise=2.0, light=0.1)
 
 
 def rendered_records(camera: Any, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
-    """The image file of each record; see ``Rendering``.
-
-    Raises:
-        ConfigError: the truth has a bent board, which cannot be drawn.
-    """
+    """The image file of each record; see ``Rendering``."""
     if any(float(values[f"{name}_bend_{axis}"][0]) for name in camera.board_names for axis in "xy"):
         raise ConfigError("found a board that is bent, expected flat ones: images are drawn of these alone.")
     kpx = 1000.0

@@ -21,8 +21,7 @@ from armcal.errors import ProblemError
 from armcal.problem.rigid_alignment import hand_eye as rotations_of
 from scipy.spatial.transform import Rotation
 
-from armcal_camera.board import Board, Chessboard
-from armcal_camera.images import opencv
+from armcal_camera.board import Board, Chessboard, opencv
 
 FEWEST_POINTS = 4  # of a board in an image
 
@@ -78,8 +77,6 @@ _TURNED_RAD = 0.02
 
 
 class HandEye(NamedTuple):
-    """A solution of A X = Y B."""
-
     x: Array  # 4 x 4 (m)
     y: Array
     left_m: float  # typical distance (median, m) between A X and Y B

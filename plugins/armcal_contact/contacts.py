@@ -88,7 +88,7 @@ class PlaneContactSettings(ContactSettings):
 
 
 class PlaneContact(OneArmContact):
-    """The measurement ``plane_contact``: tip_x, tip_y, tip_z in the tool frame; of each plane tilt_1, tilt_2 (rad) and offset (m)."""  # noqa: E501
+    """The measurement ``plane_contact``: tip_x to tip_z in the tool frame; of each plane tilt_1, tilt_2, offset."""
 
     Settings: ClassVar[type[PlaneContactSettings]] = PlaneContactSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"noise_mm": 0.05, "tip_mm": [0, 0, 60]}
@@ -97,7 +97,7 @@ class PlaneContact(OneArmContact):
         return point_blocks("tip", self.settings.tip)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
-        """How a plane is tilted from the stated normal (rad), and how far it lies from the origin (m)."""
+        # How a plane is tilted from the stated normal (rad), and how far it lies from the origin (m)
         tilts = [scalar(f"tilt_{i}", "rad", 0.0, 0.05) for i in (1, 2)]
         return tuple(replace(block, free=True) for block in (*tilts, scalar("offset", "m", 0.0, 0.01)))
 
@@ -139,7 +139,7 @@ class ClampedToolSettings(ContactSettings):
 
 
 class ClampedTool(OneArmContact):
-    """The measurement ``clamped_tool``: parameters fixture_x .. fixture_rotation; of each point point_x .. point_rotation."""  # noqa: E501
+    """The measurement ``clamped_tool``: fixture_x .. fixture_rotation; of each point point_x .. point_rotation."""
 
     Settings: ClassVar[type[ClampedToolSettings]] = ClampedToolSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
@@ -160,7 +160,6 @@ class ClampedTool(OneArmContact):
         return tuple(self.settings.points)
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The point is where the tool is."""
         here = pose_transform("fixture", values).inverse() @ self.base_T_tool(arms)
         place = {f"point_{axis}": here.translation[i] for i, axis in enumerate("xyz")}
         return {**place, "point_rotation": quaternion_expression(here.rotation)}
@@ -172,7 +171,6 @@ class ClampedTool(OneArmContact):
         return ca.vertcat(error.translation, se3.rotation_vector(error.rotation))
 
     def noise(self) -> tuple[float, ...]:
-        """Of the position (m) and of the rotation (rad)."""
         return (self.settings.noise,) * 3 + (self.settings.orientation_noise,) * 3
 
     def dimensions(self) -> tuple[str, ...]:
@@ -215,7 +213,7 @@ class BallInSocketSettings(ContactSettings):
 
 
 class BallInSocket(OneArmContact):
-    """The measurement ``ball_in_socket``: parameters centre_x, centre_y, centre_z in the tool frame, and each socket's x, y, z."""  # noqa: E501
+    """The measurement ``ball_in_socket``: centre_x to centre_z in the tool frame, and each socket's x, y, z."""
 
     Settings: ClassVar[type[BallInSocketSettings]] = BallInSocketSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {
@@ -233,13 +231,11 @@ class BallInSocket(OneArmContact):
         return point_blocks("centre", self.settings.centre)
 
     def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
-        """A socket's place in the base frame (m); fixed if it is known."""
         known = self.settings.sockets.get(group)
         blocks = [scalar(axis, "m", x, 0.01) for axis, x in zip("xyz", known or (0.0, 0.0, 0.0), strict=True)]
         return tuple(replace(block, free=known is None) for block in blocks)
 
     def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The socket is where the ball is."""
         place = self._ball(arms, values)
         return {axis: place[i] for i, axis in enumerate("xyz")}
 

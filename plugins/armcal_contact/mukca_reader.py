@@ -9,7 +9,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -47,16 +47,6 @@ class MukcaSettings(Settings):
     weights: Literal["positions", "postures"] = "postures"
 
 
-@dataclass(frozen=True)
-class SocketFile:
-    """One file: the position's and the socket's name, and its content."""
-
-    path: Path
-    position: str
-    socket: str
-    raw: bytes
-
-
 class MukcaReader:
     """The reader ``mukca``: text labels ``position`` and ``socket``, ids such as ``front/hole_0/12`` (the line)."""
 
@@ -71,108 +61,82 @@ class MukcaReader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """All postures of the folder, in SI; ``rows`` are lines of their files.
-
-        Raises:
-            DataError: with file, line and column.
-        """
+        """All postures of the folder, in SI; ``rows`` are lines of their files."""
         folder = self._settings.path
-        files, warnings = found_files(folder)
+        files, warnings = _found(folder)
         try:
             arm = request.arms[named_arm(self._settings.arm, tuple(request.arms))]
         except ValueError as fault:
             hint = "Set arm: NAME in the data section."
             raise DataError(f"{fault}.", where=Location(str(folder), field="arm"), hint=hint) from fault
-        requested_channels = [
-            w for w in request.channels if w.channel in {f"{arm.name}.{joint}" for joint in arm.commanded}
-        ]
-        tables = [_rows(file, requested_channels) for file in files]
-        names = [(file, line) for file, (lines, _) in zip(files, tables, strict=True) for line in lines]
+        channels = [w for w in request.channels if w.channel in arm.command_channels]
+        tables = [_rows(path, content, channels) for path, content in files.items()]
+        lines = [(path, line) for path, (numbers, _) in zip(files, tables, strict=True) for line in numbers]
         joints = np.concatenate([joints for _, joints in tables])
         dataset = Dataset(
-            tuple(f"{file.position}/{file.socket}/{line}" for file, line in names),
-            {w.channel: joints[:, i] for i, w in enumerate(requested_channels)},
-            {POSITION: tuple(f.position for f, _ in names), SOCKET: tuple(f.socket for f, _ in names)},
-            tuple(line for _, line in names),
+            tuple(f"{path.parent.name}/{path.stem}/{line}" for path, line in lines),
+            {w.channel: joints[:, i] for i, w in enumerate(channels)},
+            {POSITION: tuple(p.parent.name for p, _ in lines), SOCKET: tuple(p.stem for p, _ in lines)},
+            tuple(line for _, line in lines),
             str(folder),
-            hash_of(files),
+            hashlib.sha256(b"".join(files.values())).hexdigest(),
             warnings=warnings,
         )
         checked = read_as(dataset, request, by_id=True)
         return _weighed(checked, request) if self._settings.weights == "positions" else checked
 
 
-def found_files(folder: Path) -> tuple[tuple[SocketFile, ...], tuple[str, ...]]:
-    """The files of all positions, sorted by their paths, and what a user should know of the rest.
-
-    Raises:
-        DataError: there is no such folder, no position in it, or a file cannot be read or is a copy of another.
-    """
+def _found(folder: Path) -> tuple[dict[Path, bytes], tuple[str, ...]]:
+    """The files of all positions with their content, sorted by path, and what a user should know of the rest."""
     if not folder.exists():
         refuse(folder, "there is no such folder.", "Check the path.")
     if not folder.is_dir():
         refuse(folder, "it is a file, expected a folder.", _LAYOUT)
-    files: list[SocketFile] = []
+    files: dict[Path, bytes] = {}
+    warnings = []
     try:
-        warnings = [_ignored(path) for path in sorted(folder.iterdir()) if not path.is_dir() and _is_table(path)]
+        others = [path for path in sorted(folder.iterdir()) if not path.is_dir()]
+        own = any(_SOCKET_FILE.fullmatch(path.name) for path in others)
         for place in sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")):
             inside = sorted(place.iterdir())
             sockets = [path for path in inside if _SOCKET_FILE.fullmatch(path.name)]
-            warnings += [_ignored(path) for path in inside if path not in sockets and _is_table(path)]
-            files += [_file(path, folder) for path in sockets]
+            others += [path for path in inside if path not in sockets]
+            for path in sockets:
+                if not path.resolve().is_relative_to(folder.resolve()):
+                    refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
+                files[path] = input_bytes(path, MAX_BYTES, "a CSV file")
             if len(sockets) < 2:
                 named = f"has only {sockets[0].name}" if sockets else "has no file hole_0.csv, hole_1.csv, ..."
                 rest = "nothing is known of the distance of its sockets" if sockets else "it is ignored"
                 warnings.append(f"{place}: the position {named}: {rest}.")
-        own = any(_SOCKET_FILE.fullmatch(path.name) for path in folder.iterdir())
     except OSError as fault:
         path = Path(str(fault.filename)) if fault.filename else folder
         refuse(path, f"it cannot be read ({fault.strerror or fault}).", "Check the path and its permissions.")
     if not files:
         where = " (its files lie in the folder itself: is it one position?)" if own else ""
         refuse(folder, f"found no position in it, expected folders with hole_0.csv and hole_1.csv{where}.", _LAYOUT)
-    first: dict[bytes, SocketFile] = {}
-    for file in files:  # no ball sits in two sockets in the same postures
-        other = first.setdefault(file.raw, file)
-        if other is not file and file.raw.strip():
-            refuse(file.path, f"it is a copy of {other.path}.", "Give each socket its own recording.")
-    return tuple(files), tuple(warnings)
+    first: dict[bytes, Path] = {}
+    for path, content in files.items():  # no ball sits in two sockets in the same postures
+        other = first.setdefault(content, path)
+        if other is not path and content.strip():
+            refuse(path, f"it is a copy of {other}.", "Give each socket its own recording.")
+    text = "it is ignored; only hole_0.csv, hole_1.csv, ... in a position's folder are read."
+    ignored = [f"{path}: {text}" for path in others if path.suffix.lower() == ".csv"]
+    return files, (*ignored, *warnings)
 
 
-def hash_of(files: Sequence[SocketFile]) -> str:
-    """sha256 of the contents, one file after the other."""
-    return hashlib.sha256(b"".join(file.raw for file in files)).hexdigest()
-
-
-def _file(path: Path, folder: Path) -> SocketFile:
-    if not path.resolve().is_relative_to(folder.resolve()):
-        refuse(path, "it is a link that leads out of the folder.", "Put the recording itself there.")
-    return SocketFile(path, path.parent.name, path.stem, input_bytes(path, MAX_BYTES, "a CSV file"))
-
-
-def _is_table(path: Path) -> bool:
-    return path.suffix.lower() == ".csv"
-
-
-def _ignored(path: Path) -> str:
-    return f"{path}: it is ignored; only hole_0.csv, hole_1.csv, ... in a position's folder are read."
-
-
-def _rows(file: SocketFile, requested_channels: Sequence[RequestedChannel]) -> tuple[tuple[int, ...], Array]:
+def _rows(path: Path, content: bytes, channels: Sequence[RequestedChannel]) -> tuple[tuple[int, ...], Array]:
     """The lines (from 1) of a file's postures, and the joints' displacements (lines x joints; rad or m)."""
-    path, hint = file.path, "Give a row a posture, or remove the file."
-    with open_table(path, most=MAX_BYTES, empty=hint, content=file.raw) as table:
+    hint = "Give a row a posture, or remove the file."
+    with open_table(path, most=MAX_BYTES, empty=hint, content=content) as table:
         line, cells = table.first
-        if len(cells) != len(requested_channels):
-            arm = requested_channels[0].channel.partition(".")[0] if requested_channels else "arm"
-            text = (
-                f"found {len(cells)} columns, expected {len(requested_channels)}: a joint angle of the arm {arm} each."
-            )
+        if len(cells) != len(channels):
+            arm = channels[0].channel.partition(".")[0] if channels else "arm"
+            text = f"found {len(cells)} columns, expected {len(channels)}: a joint angle of the arm {arm} each."
             refuse(path, text, "Give this arm's recordings, comma separated.", line)
-        names = [f"column {i} ({w.channel.partition('.')[2]})" for i, w in enumerate(requested_channels, 1)]
-        named = list(enumerate(names))
-        read = table.columns(named, has_header=False, number=partial(_number, path))
-    for joint, name, column in zip(requested_channels, names, read.numbers, strict=True):
+        names = [f"column {i} ({w.channel.partition('.')[2]})" for i, w in enumerate(channels, 1)]
+        read = table.columns(list(enumerate(names)), has_header=False, number=partial(_number, path))
+    for joint, name, column in zip(channels, names, read.numbers, strict=True):
         over = np.flatnonzero((np.abs(column) > _FULL_TURN * (1 + 1e-9)) & np.isfinite(column))
         if joint.dimension == "angle" and not joint.is_endless and over.size:
             text = f"found {column[over[0]]:.10g} rad, more than one turn (2 pi rad): are these degrees?"

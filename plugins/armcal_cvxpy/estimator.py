@@ -39,12 +39,7 @@ class CvxpyEstimator:
     def __init__(self, settings: CvxpySettings) -> None:
         self._settings = settings
 
-    def solve(
-        self,
-        problem: Problem,
-        start: Array,
-        progress: Progress = no_progress,
-    ) -> Solution:
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
         """From ``start`` until no step saves anything."""
         began = time.perf_counter()
         if not problem.increments:

@@ -25,7 +25,7 @@ from armcal.base.settings import Settings
 from armcal.calibration.exporter import Exported, ExportRequest, changed_numbers, random_commands
 from armcal.calibration.tool_expression import ToolExpression
 from armcal.errors import ConfigError, InputError, Location, NotConvergedError, ProblemError
-from armcal.functions.c_source import LIBRARY, TWO_ARGUMENTS, operations
+from armcal.functions.c_source import LIBRARY, operations
 from armcal.functions.compiler import find_compiler
 from armcal.io.plain_files import writing
 from pydantic import field_validator
@@ -244,7 +244,7 @@ def c_function(function: ca.Function, name: str, inputs: Sequence[str], outputs:
             if operation in _OPERATORS:
                 value = _OPERATORS[operation].format(*operands)
             elif operation in _LIBRARY:
-                value = f"{_LIBRARY[operation]}({', '.join(operands if operation in TWO_ARGUMENTS else operands[:1])})"
+                value = f"{_LIBRARY[operation]}({', '.join(operands)})"
             else:
                 raise ConfigError(
                     f"the arm's expression has the operation {operation}, which has no form in C99.",

@@ -5,8 +5,6 @@ with the data. Where semidefinite matrices are free, it begins with steps of qua
 are kept exactly: its bound relaxation is off. It also ends, converged, where the best step left
 would lower the cost by no more than its rounding errors.
 
-Steps over semidefinite matrices before the fit itself.
-
 Residuals are nearly linear in a matrix, and far from it in its root, which IPOPT moves: a search over all records would
 take hundreds of steps along the root's curves. So it first searches a quadratic model of the cost in the matrix's own
 entries, which needs no records, and the model is made anew where that ends.
@@ -18,13 +16,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import casadi as ca
 import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.domains import Semidefinite, symmetric
-from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Progress, Solution, SolverVerdict, no_progress
@@ -47,17 +44,10 @@ _SUFFICIENT, _TRUSTED = 1e-4, 0.75
 class Posed(Protocol):
     """What IPOPT needs to know of a cost over ``x`` (n), as of a ``PosedProblem``."""
 
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of ``x``."""
-
-    def cost(self, x: Array) -> float:
-        """The cost; infinite where there is none."""
-
-    def model(self, x: Array) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian."""
-
-    def exact_hessian(self, x: Array) -> Array:
-        """The Hessian."""
+    def bounds(self) -> tuple[Array, Array]: ...
+    def cost(self, x: Array) -> float: ...  # infinite where there is none
+    def model(self, x: Array) -> NormalEquations: ...  # Gauss-Newton
+    def exact_hessian(self, x: Array) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -89,10 +79,6 @@ class QuadraticModel(Posed):
         )
 
 
-def has_matrices(parameters: Parameters) -> bool:
-    return any(isinstance(block.domain, Semidefinite) for block in parameters.free)
-
-
 def approached(posed: PosedProblem, x: Array, solved: Callable[[Posed, Array], Array]) -> Array:
     """Where steps of quadratic models lead, damped where one does not hold [Nocedal2006]; ``solved`` minimises a model.
 
@@ -119,7 +105,6 @@ def approached(posed: PosedProblem, x: Array, solved: Callable[[Posed, Array], A
 
 
 def _model(posed: PosedProblem, x: Array) -> NormalEquations | None:
-    """The quadratic model by coordinates; None where the arm has no equilibrium."""
     try:
         return posed.convex_model(x)
     except NotConvergedError:
@@ -136,8 +121,6 @@ def definite(posed: PosedProblem, x: Array, least: float) -> Array:
             values[place] = lifted[np.triu_indices(3)]
     return np.asarray(np.clip(posed.x(values), *posed.bounds()))
 
-
-T = TypeVar("T")
 
 _SAME_COST = 1e-6
 _BARRIER_START = 1e-8
@@ -173,12 +156,7 @@ class IpoptEstimator:
     def spread(self, executor: Executor) -> IpoptEstimator:
         return IpoptEstimator(self._settings, executor)
 
-    def solve(
-        self,
-        problem: Problem,
-        start: Array,
-        progress: Progress = no_progress,
-    ) -> Solution:
+    def solve(self, problem: Problem, start: Array, progress: Progress = no_progress) -> Solution:
         """The best of one or several starts; the first is ``start`` itself."""
         began = time.perf_counter()
         if not problem.increments:
@@ -208,7 +186,7 @@ def _solve_once(settings: IpoptSettings, problem: Problem, start: Array) -> _Run
         iterations += 1
         return _searched(settings, model, x).x
 
-    if has_matrices(problem.parameters):
+    if any(isinstance(block.domain, Semidefinite) for block in problem.parameters.free):
         start = approached(posed, start, solved)
     run = _searched(settings, posed, start)
     return replace(run, iterations=run.iterations + iterations)
@@ -271,7 +249,7 @@ def _solver(settings: IpoptSettings, callbacks: list[_Callback], watch: _Watch, 
 
 @dataclass(frozen=True)
 class _Run:
-    """One start's end: where, at what cost, and in IPOPT's words why it stopped."""
+    """One start's end; ``status`` is in IPOPT's words."""
 
     x: Array
     cost: float
@@ -350,8 +328,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]
         super().__init__()
         self._function = getattr(objective, what)
         size = objective.size
-        self._shape = {"cost": (1, 1), "gradient": (size, 1), "hessian": (size, size)}[what]
-        self._size = size
+        self._size, self._shape = size, {"cost": (1, 1), "gradient": (size, 1), "hessian": (size, size)}[what]
         self.construct(what, {})
 
     @override

@@ -5,8 +5,4 @@ from armcal.hooks import Register, hookimpl
 
 @hookimpl
 def armcal_register_estimators(register: Register) -> None:
-    register(
-        "ipopt",
-        "armcal_ipopt.estimator:IpoptEstimator",
-        "interior point, bounds and priors, Gauss-Newton or exact",
-    )
+    register("ipopt", "armcal_ipopt.estimator:IpoptEstimator", "interior point; bounds, priors; Gauss-Newton or exact")

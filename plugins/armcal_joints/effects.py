@@ -9,7 +9,7 @@ from armcal.arm.effects import XYZ, EffectSettings, JointCommand, JointEffect, S
 from armcal.arm.model import Attachment, Chain
 from armcal.arm.servo import PulseClock, PulseTable, SteppedEffect, quantised, without_slope
 from armcal.base.config_text import resolve_path
-from armcal.base.domains import Interval, Semidefinite
+from armcal.base.domains import Domain, Interval, Semidefinite
 from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.se3 import Transform
 from armcal.base.settings import Compliance, Settings, Temperature, Torque
@@ -45,7 +45,6 @@ class ThermalLength(JointEffect):
         self._names = tuple(f"expansion{link}" if separate else "expansion" for link in links)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Coefficients of linear expansion (1/K)."""
         physical = Interval(lower=0.0)
         return tuple(scalar(name, "per_K", 0.0, EXPANSION_SCALE_PER_K, physical) for name in dict.fromkeys(self._names))
 
@@ -107,7 +106,6 @@ class ServoMap(JointEffect):
         return {f"offset{joint}": joint for joint in self.joints}
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """Gain error times command, plus the offset (rad)."""
         joint, commanded = command.joint, command.commanded
         if joint not in self.joints:
             return 0
@@ -132,7 +130,6 @@ class GearError(JointEffect):
         )
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """The harmonics at the commanded angle (rad)."""
         joint = command.joint
         if joint not in self.joints:
             return 0
@@ -192,11 +189,7 @@ class QuantisationSettings(Settings):
         return self
 
     def clocked(self) -> dict[str, tuple[PulseTable, PulseClock]]:
-        """Each joint's table, and the clock of its board.
-
-        Raises:
-            ValueError: no board can make these pulses.
-        """
+        """Each joint's table, and the clock of its board."""
         if self.servos:
             return {joint: (servo.table, servo.clock) for joint, servo in self.servos.items()}
         prescale = self.prescale or PulseClock.prescale_for(self.oscillator_hz, self.rate_hz)
@@ -227,11 +220,9 @@ class Quantisation(SteppedEffect):
             check_longest(table, clock)
 
     def servos(self) -> Mapping[int, tuple[PulseTable, PulseClock]]:
-        """Pulse table and clock by the joint's index; a joint without a table is not stepped."""
         return dict(self._servos)
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """From the commanded angle to the one that is set (rad)."""
         servo = self._servos.get(command.index)
         return 0 if servo is None else without_slope(quantised(command.commanded, *servo) - command.commanded)
 
@@ -257,7 +248,6 @@ class Delay(JointEffect):
         return (scalar("delay", "s", 0.0, _SCALE_S),)
 
     def shaped(self, chain: Chain, conditions: Mapping[str, Any], values: Mapping[str, Any]) -> Chain:
-        """Joints where they were at the time of the measurement: a rate times the delay beyond the recorded place."""
         joints = list(chain.joints)
         for number, name in self._rates.items():
             joint = joints[number - 1]
@@ -267,17 +257,26 @@ class Delay(JointEffect):
 
 COMPLIANCE_SCALE_RAD_PER_NM = 0.05
 CUBIC_SCALE_RAD_PER_NM3 = 0.05
+PLAY_SCALE_RAD = 0.01
 _AXES = dict(zip("xyz", XYZ, strict=True))
 
 
 class SiteSprings(JointEffect):
-    """Springs of one law: at joints, and at the base where the settings say so."""
+    """Springs of one law with a number each: at joints, and at the base where the settings say so."""
 
     letter: ClassVar[str]  # of the sites' parameters, before the number: 0 for the base, i for joint i
+    unit: ClassVar[str] = "rad"
+    scale: ClassVar[float] = PLAY_SCALE_RAD
+    domain: ClassVar[Domain] = Interval(lower=0.0)
+    nominal: tuple[float, ...] = (0.0,)
 
     @property
     def sites(self) -> tuple[int, ...]:
         return (0, *self.joints) if getattr(self.settings, "base", False) else self.joints
+
+    def parameters(self) -> tuple[ParameterBlock, ...]:
+        own = (self.unit, self.nominal, self.domain, self.scale)
+        return tuple(ParameterBlock(f"{self.letter}{site}", *own) for site in self.sites)
 
     def springs(self, values: Mapping[str, Any]) -> tuple[Spring, ...]:
         return tuple(self.spring(site, values[f"{self.letter}{site}"]) for site in self.sites)
@@ -291,6 +290,10 @@ class TorsionalSpringSettings(EffectSettings):
 
     base_axis: Literal["x", "y", "z"] | None = None
     compliance: Compliance = 0.0
+
+    @property
+    def base(self) -> bool:
+        return self.base_axis is not None
 
     @field_validator("compliance")
     @classmethod
@@ -307,21 +310,13 @@ class TorsionalSprings(SiteSprings):
     about that frame's origin. The physical bound k >= 0 is part of the parameters' domain.
     """
 
-    letter = "k"
+    letter, unit, scale = "k", "rad_per_Nm", COMPLIANCE_SCALE_RAD_PER_NM
     Settings = TorsionalSpringSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"base_axis": "y", "compliance_rad_per_Nm": 0.01}
 
-    @property
-    def sites(self) -> tuple[int, ...]:
-        """Where a spring is: 0 for the base, i for joint i."""
-        return (0, *self.joints) if self.settings.base_axis else self.joints
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        physical = Interval(lower=0.0)
-        nominal = self.settings.compliance
-        return tuple(
-            scalar(f"k{site}", "rad_per_Nm", nominal, COMPLIANCE_SCALE_RAD_PER_NM, physical) for site in self.sites
-        )
+    def __init__(self, settings: TorsionalSpringSettings, joint_names: Sequence[str]) -> None:
+        super().__init__(settings, joint_names)
+        self.nominal = (settings.compliance,)
 
     def spring(self, site: int, value: Any) -> Spring:
         directions = () if site else (_AXES[self.settings.base_axis],)
@@ -334,10 +329,7 @@ class CubicSprings(SiteSprings):
     It stands beside a linear spring. A negative value is a spring that stiffens; alone it would push back.
     """
 
-    letter = "c"
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        return tuple(scalar(f"c{joint}", "rad_per_Nm3", 0.0, CUBIC_SCALE_RAD_PER_NM3) for joint in self.joints)
+    letter, unit, scale, domain = "c", "rad_per_Nm3", CUBIC_SCALE_RAD_PER_NM3, Interval()
 
     def spring(self, site: int, value: Any) -> Spring:
         return Spring(site, (), lambda load, command: value * load * load * load)
@@ -361,22 +353,19 @@ class Compliances(SiteSprings):
     with the mount's, and only the sum of their matrices would be determined.)
     """  # noqa: E501
 
-    letter = "C"
+    letter, unit, scale, domain = "C", "rad_per_Nm", COMPLIANCE_SCALE_RAD_PER_NM, Semidefinite()
     Settings = ComplianceSettings
     EXAMPLE: ClassVar[Mapping[str, Any]] = {"compliance_rad_per_Nm": 0.02}
 
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        c = self.settings.compliance
-        nominal, scale = (c, 0.0, 0.0, c, 0.0, c), COMPLIANCE_SCALE_RAD_PER_NM
-        return tuple(ParameterBlock(f"C{site}", "rad_per_Nm", nominal, Semidefinite(), scale) for site in self.sites)
+    def __init__(self, settings: ComplianceSettings, joint_names: Sequence[str]) -> None:
+        super().__init__(settings, joint_names)
+        c = settings.compliance
+        self.nominal = (c, 0.0, 0.0, c, 0.0, c)
 
     def spring(self, site: int, value: Any) -> Spring:
         xx, xy, xz, yy, yz, zz = (value[i] for i in range(6))
         matrix = ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz))
         return Spring(site, XYZ, lambda moment, command: ca.mtimes(matrix, moment))
-
-
-PLAY_SCALE_RAD = 0.01
 
 
 class ApproachBacklash(JointEffect):
@@ -390,7 +379,6 @@ class ApproachBacklash(JointEffect):
         return tuple(scalar(f"lag{joint}", "rad", 0.0, PLAY_SCALE_RAD) for joint in self.joints)
 
     def displacement(self, command: JointCommand, values: Mapping[str, Any]) -> Any:
-        """Against the direction of the last motion (rad)."""
         return -values[f"lag{command.joint}"] * command.approach if command.joint in self.joints else 0
 
 
@@ -408,11 +396,6 @@ class TorqueBacklash(SiteSprings):
 
     letter = "play"
     Settings = TorqueBacklashSettings
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        """One half-width a joint; a torque pushes along, never against itself."""
-        physical = Interval(lower=0.0)
-        return tuple(scalar(f"play{joint}", "rad", 0.0, PLAY_SCALE_RAD, physical) for joint in self.joints)
 
     def spring(self, site: int, value: Any) -> Spring:
         floor = self.settings.transition**2
@@ -434,10 +417,6 @@ class BearingPlay(SiteSprings):
 
     letter = "tilt"
     Settings = BearingPlaySettings
-
-    def parameters(self) -> tuple[ParameterBlock, ...]:
-        physical = Interval(lower=0.0)
-        return tuple(scalar(f"tilt{site}", "rad", 0.0, PLAY_SCALE_RAD, physical) for site in self.sites)
 
     def spring(self, site: int, value: Any) -> Spring:
         floor = self.settings.transition**2

@@ -29,8 +29,6 @@ class ExtendedFilter(OnlineEstimator):
 
     def __init__(self, settings: ExtendedSettings) -> None:
         self._settings = settings
-        # Workspaces by size: nothing of one update is used in the next.
-        self._filters: dict[tuple[int, int], ExtendedKalmanFilter] = {}
 
     @override
     def update(self, prior: Gaussian, observation: Observation) -> Update:
@@ -44,10 +42,7 @@ class ExtendedFilter(OnlineEstimator):
                 break
             point, record = following, observation.at(following)
         innovation = record.innovation + record.slope @ (point - prior.mean)
-        size = len(point), len(innovation)
-        if size not in self._filters:
-            self._filters[size] = ExtendedKalmanFilter(*size)
-        one = self._filters[size]
+        one = ExtendedKalmanFilter(len(point), len(innovation))
         one.x, one.P, one.R = prior.mean, prior.covariance, record.noise
         # filterpy asks for a predicted and a measured value: their difference is all it uses.
         one.update(innovation, lambda x: record.slope, lambda x: np.zeros(len(innovation)))

@@ -102,9 +102,7 @@ class MdhModel:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """As configured, else q1, q2, ..."""
-        count = len(self._settings.rows)
-        return self._settings.joints or tuple(f"q{i}" for i in range(1, count + 1))
+        return self._settings.joints or tuple(f"q{i}" for i in range(1, len(self._settings.rows) + 1))
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
         blocks = [_block(name, value) for name, value in self._step_values("base", self._settings.base)]
@@ -115,7 +113,6 @@ class MdhModel:
         return tuple(blocks + [_block(n, v) for n, v in self._step_values("tool", self._settings.tool)])
 
     def chain(self, values: Mapping[str, Any]) -> Chain:
-        """The rows as a chain; every row's motion is about or along z."""
         joints: list[Joint] = []
         frames: dict[str, Attachment] = {}
         pending = se3.identity()

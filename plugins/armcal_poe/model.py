@@ -21,7 +21,6 @@ from armcal.base.se3 import Expression, Transform
 from armcal.base.settings import Angle, Length, Length3, Settings
 from pydantic import Field, field_validator, model_validator
 
-Vector = tuple[float, float, float]
 SHORTEST_AXIS = 1e-9
 
 
@@ -29,7 +28,7 @@ class _JointSettings(Settings):
     """What all joints have: a name, and the direction of their axis in the base frame at zero angles, of any length."""
 
     name: str | None = None
-    axis: Vector
+    axis: Vector3
 
     @field_validator("name")
     @classmethod
@@ -40,14 +39,14 @@ class _JointSettings(Settings):
 
     @field_validator("axis")
     @classmethod
-    def _unit(cls, axis: Vector) -> Vector:
+    def _unit(cls, axis: Vector3) -> Vector3:
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
             raise ValueError(f"found an axis of length {length:g}, expected a direction: [0, 0, 1]")
         return axis
 
     @property
-    def direction(self) -> Vector:
+    def direction(self) -> Vector3:
         x, y, z = np.array(self.axis) / np.linalg.norm(self.axis)
         return float(x), float(y), float(z)
 
@@ -74,20 +73,17 @@ JointSettings = Annotated[RevoluteSettings | PrismaticSettings, Field(discrimina
 class PoeSettings(Settings):
     """An arm in screws, all given in the base frame at zero angles.
 
-    Attributes:
-        mount: where the arm stands, for springs at the base and masses on it; it moves nothing.
-        parametrisation: ``minimal`` keeps axes axes: four numbers for a joint that turns, two for one that slides.
-            ``full`` gives every joint six free numbers.
+    ``parametrisation: minimal`` keeps axes axes: four numbers for a joint that turns, two for one that slides;
+    ``full`` gives every joint six free numbers.
     """
 
     joints: Annotated[tuple[JointSettings, ...], Field(min_length=1)]  # from the base to the tip
     tool: PoseSettings  # the pose of the tool at zero angles
-    mount: PoseSettings = PoseSettings.si()
+    mount: PoseSettings = PoseSettings.si()  # for springs at the base and masses on it; it moves nothing
     parametrisation: Literal["minimal", "full"] = "minimal"
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """As configured, else q1, q2, ..."""
         return tuple(joint.name or f"q{i}" for i, joint in enumerate(self.joints, start=1))
 
     @model_validator(mode="after")
@@ -110,10 +106,10 @@ _Z: Vector3 = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class NominalAxis:
-    """An axis as configured: a unit direction and a point on it (m), in the base frame."""
+    """An axis as configured, in the base frame."""
 
-    direction: Array
-    point: Array
+    direction: Array  # unit
+    point: Array  # on it (m)
 
     @property
     def twist(self) -> Array:
@@ -186,11 +182,9 @@ class PoeModel:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """As configured, else q1, q2, ..."""
         return self._settings.joint_names
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """Every joint's axis and offset, and the tool."""
         blocks: list[ParameterBlock] = []
         for i, (joint, axis) in enumerate(zip(self._settings.joints, self._axes, strict=True), start=1):
             turns = isinstance(joint, RevoluteSettings)

@@ -22,7 +22,7 @@ from armcal.config.yaml_source import load_config
 from armcal.devices.clock import Clock
 from armcal.devices.live import REPEATED, Tracker, TrackerFrame
 from armcal.errors import ConfigError, NotConvergedError
-from armcal.functions.interpreted import BoundFunction
+from armcal.functions.batch_function import BoundFunction
 from armcal.run.experiment import Experiment
 from pydantic import Field
 from typing_extensions import override

@@ -1,17 +1,21 @@
-"""Records from a CSV file: a header, columns by name with their unit as suffix (``q1_deg``, ``x_mm``)."""
+"""Records from a CSV file: a header, columns by name with their unit as suffix (``q1_deg``, ``x_mm``).
 
-from collections.abc import Iterator, Mapping
+With orientations in it, too (``pose_csv``).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.base.arrays import Array
+from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.base.settings import InputPath, Settings
 from armcal.base.units import DIMENSIONLESS, from_unit
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.errors import DataError, Location
+from armcal.io.plain_files import refuse
 from armcal.measure.checks import Layout, read_as, require_records, set_aside, warned
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal.measure.tables import (
@@ -62,11 +66,7 @@ class CsvReader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """The records of the file, in SI; ``rows`` are lines, the header's being 1.
-
-        Raises:
-            DataError: with file, line and column.
-        """
+        """The records of the file, in SI; ``rows`` are lines, the header's being 1."""
         s, source = self._settings, str(self._settings.path)
         with open_table(s.path, delimiter=s.delimiter) as table:
             line, cells = table.first
@@ -147,44 +147,31 @@ def _number(cell: str, line: int, column: Column, header: Header, has_commas: bo
 
 
 QUATERNION = ("qw", "qx", "qy", "qz")
-TURNS = ("turn1", "turn2", "turn3")
-MATRIX = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
-_OTHER = {"xyzw": "wxyz", "wxyz": "xyzw"}
-_Nine = tuple[str, str, str, str, str, str, str, str, str]
 
 
 class Orientation(Settings):
-    """How a file gives base_T_body's rotation.
-
-    Values are numbers of all records, one row each, in the order of ``mapped``.
-    """
+    """The columns of base_T_body's rotation as they stand in the file; values are their numbers, a row a record."""
 
     kind: ClassVar[str]  # What one of them is called
+    columns: tuple[str, ...]
 
     @property
     def declared(self) -> str:
         raise NotImplementedError
 
-    def mapped(self) -> Mapping[str, str]:
-        raise NotImplementedError
-
-    def size(self, values: Array) -> Array:
-        """How large each is (N); zero for none at all."""
-        return np.ones(len(values))
+    @property
+    def names(self) -> Sequence[str]:
+        return [f"turn{i}" for i in range(1, len(self.columns) + 1)]
 
     def fault(self, values: Array) -> Array:
-        """How far each is from a rotation or a reflection (N)."""
+        """How far each is from a rotation or a reflection (N); any three angles are a rotation, three zeros too."""
         return np.zeros(len(values))
 
     def rotations(self, values: Array) -> Rotation:
-        """Of each record.
-
-        Raises:
-            ValueError: a value is none.
-        """
         raise NotImplementedError
 
     def others(self, values: Array) -> Mapping[str, Rotation]:
+        """What the columns could mean as well, in words."""
         raise NotImplementedError
 
 
@@ -200,29 +187,24 @@ class QuaternionColumns(Orientation):
     def declared(self) -> str:
         return f"order: {self.order}"
 
+    @property
     @override
-    def mapped(self) -> dict[str, str]:
-        own = dict(zip(self.order, self.columns, strict=True))
-        return {name: own[name[1]] for name in QUATERNION}
-
-    @override
-    def size(self, values: Array) -> Array:
-        return np.asarray(np.linalg.norm(values, axis=1))
+    def names(self) -> Sequence[str]:
+        return [f"q{part}" for part in self.order]
 
     @override
     def fault(self, values: Array) -> Array:
-        return np.abs(self.size(values) - 1)
+        return np.asarray(np.abs(np.linalg.norm(values, axis=1) - 1))
 
     @override
     def rotations(self, values: Array) -> Rotation:
-        return Rotation.from_quat(values[:, [1, 2, 3, 0]])
+        return Rotation.from_quat(values[:, [self.order.index(part) for part in "xyzw"]])
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
         """The other order; it is the inverse between two fixed rotations, so that no turn of records shows it."""
-        other = _OTHER[self.order]
-        in_file = values[:, ["wxyz".index(part) for part in self.order]]
-        exchanged = Rotation.from_quat(in_file[:, [other.index(part) for part in "xyzw"]])
+        other = "wxyz" if self.order == "xyzw" else "xyzw"
+        exchanged = Rotation.from_quat(values[:, [other.index(part) for part in "xyzw"]])
         return {f"order: {other}, or as body_T_base,": exchanged}
 
 
@@ -230,20 +212,12 @@ class RotationColumns(Orientation):
     """The nine columns of a rotation matrix, row by row."""
 
     kind = "rotation matrix"
-    columns: _Nine
+    columns: tuple[str, str, str, str, str, str, str, str, str]
 
     @property
     @override
     def declared(self) -> str:
         return "the matrix row by row"
-
-    @override
-    def mapped(self) -> dict[str, str]:
-        return dict(zip(MATRIX, self.columns, strict=True))
-
-    @override
-    def size(self, values: Array) -> Array:
-        return np.asarray(np.abs(values).max(axis=1))
 
     @override
     def fault(self, values: Array) -> Array:
@@ -261,10 +235,7 @@ class RotationColumns(Orientation):
 
 
 class AnglesColumns(Orientation):
-    """The three columns of roll, pitch and yaw: R = Rz(yaw) Ry(pitch) Rx(roll), turns about fixed axes.
-
-    Any three angles are a rotation, three zeros too.
-    """
+    """The three columns of roll, pitch and yaw: R = Rz(yaw) Ry(pitch) Rx(roll), turns about fixed axes."""
 
     kind = "triple of roll, pitch and yaw"
     columns: tuple[str, str, str]
@@ -275,33 +246,32 @@ class AnglesColumns(Orientation):
     def declared(self) -> str:
         return f"R = Rz(yaw) Ry(pitch) Rx(roll) in {self.unit}"
 
-    @override
-    def mapped(self) -> dict[str, str]:
-        return dict(zip(TURNS, self.columns, strict=True))
+    @property
+    def axes(self) -> str:
+        """The order of the turns as SciPy has it; empty for a rotation vector."""
+        return "xyz"
 
-    def turned(self, values: Array, degrees: bool) -> Rotation:
-        """The rotations, in degrees or rad."""
-        return Rotation.from_euler("xyz", values, degrees=degrees)
-
-    def alternatives(self, values: Array, degrees: bool) -> dict[str, Rotation]:
-        """Other conventions, by what they are called."""
-        return {
-            "it as rotation_vector": Rotation.from_rotvec(values, degrees=degrees),
-            "R = Rx(roll) Ry(pitch) Rz(yaw)": Rotation.from_euler("XYZ", values, degrees=degrees),
-        }
+    @property
+    def other_axes(self) -> Mapping[str, str]:
+        return {"it as rotation_vector": "", "R = Rx(roll) Ry(pitch) Rz(yaw)": "XYZ"}
 
     @override
     def rotations(self, values: Array) -> Rotation:
-        return self.turned(values, self.unit == "deg")
+        return _turned(self.axes, values, self.unit)
 
     @override
     def others(self, values: Array) -> dict[str, Rotation]:
-        degrees = self.unit == "deg"
+        other = "rad" if self.unit == "deg" else "deg"
         return {
-            **self.alternatives(values, degrees),
+            **{words: _turned(axes, values, self.unit) for words, axes in self.other_axes.items()},
             "it as that of body_T_base": self.rotations(values).inv(),
-            f"unit: {'rad' if degrees else 'deg'}": self.turned(values, not degrees),
+            f"unit: {other}": _turned(self.axes, values, other),
         }
+
+
+def _turned(axes: str, values: Array, unit: str) -> Rotation:
+    degrees = unit == "deg"
+    return Rotation.from_euler(axes, values, degrees) if axes else Rotation.from_rotvec(values, degrees)
 
 
 class EulerColumns(AnglesColumns):
@@ -325,14 +295,15 @@ class EulerColumns(AnglesColumns):
     def declared(self) -> str:
         return f"order: {self.order} in {self.unit}"
 
+    @property
     @override
-    def turned(self, values: Array, degrees: bool) -> Rotation:
-        return Rotation.from_euler(self.order, values, degrees=degrees)
+    def axes(self) -> str:
+        return self.order
 
+    @property
     @override
-    def alternatives(self, values: Array, degrees: bool) -> dict[str, Rotation]:
-        other = self.order.swapcase()
-        return {f"order: {other}": Rotation.from_euler(other, values, degrees=degrees)}
+    def other_axes(self) -> Mapping[str, str]:
+        return {f"order: {self.order.swapcase()}": self.order.swapcase()}
 
 
 class VectorColumns(AnglesColumns):
@@ -345,20 +316,15 @@ class VectorColumns(AnglesColumns):
     def declared(self) -> str:
         return f"the rotation vector of base_T_body in {self.unit}"
 
+    @property
     @override
-    def turned(self, values: Array, degrees: bool) -> Rotation:
-        return Rotation.from_rotvec(values, degrees=degrees)
+    def axes(self) -> str:
+        return ""
 
+    @property
     @override
-    def alternatives(self, values: Array, degrees: bool) -> dict[str, Rotation]:
-        return {"it as rpy": Rotation.from_euler("xyz", values, degrees=degrees)}
-
-
-def reflections(values: Array) -> Array:
-    """Places of matrices (N x 9) that mirror; none among quaternions (N x 4)."""
-    if values.shape[1] != len(MATRIX):
-        return np.zeros(0, dtype=np.intp)
-    return np.flatnonzero(np.linalg.det(values.reshape(-1, 3, 3)) < 0)
+    def other_axes(self) -> Mapping[str, str]:
+        return {"it as rpy": "xyz"}
 
 
 TOLERANCE = 1e-3  # How far a quaternion's length may be from one, or an entry of R^T R from the identity's
@@ -391,7 +357,7 @@ class PoseCsvSettings(CsvSettings):
 
     @model_validator(mode="after")
     def _one_orientation(self) -> Self:
-        if sum(given is not None for given in self._given()) != 1:
+        if len(self._given) != 1:
             raise ValueError(
                 "expected one of quaternion: {columns: [...], order: xyzw}, rotation: {columns: [...]}, "
                 "rpy: {columns: [...], unit: deg}, euler: {columns: [...], order: XYZ, unit: deg} "
@@ -399,12 +365,14 @@ class PoseCsvSettings(CsvSettings):
             )
         return self
 
-    def _given(self) -> tuple[Orientation | None, ...]:
-        return self.quaternion, self.rotation, self.rpy, self.euler, self.rotation_vector
+    @property
+    def _given(self) -> list[Orientation]:
+        every = (self.quaternion, self.rotation, self.rpy, self.euler, self.rotation_vector)
+        return [orientation for orientation in every if orientation is not None]
 
     @property
     def orientation(self) -> Orientation:
-        return next(orientation for orientation in self._given() if orientation is not None)
+        return self._given[0]
 
 
 class PoseCsvReader:
@@ -421,56 +389,53 @@ class PoseCsvReader:
         self._orientation = settings.orientation
 
     def read(self, request: ReadRequest) -> Dataset:
-        """The records of the file, in SI; ``rows`` are lines, the header's being 1.
-
-        Raises:
-            DataError: with file, line and column; or the orientations are not those of this arm.
-        """
+        """The records of the file, in SI; ``rows`` are lines, the header's being 1."""
         s, instance = self._settings, self._instance(request)
         if s.path.suffix in _SAMPLES:
             hint = f"Write data: {{type: pose_pairs, path: {s.path.name}, mounting: eye_to_hand}}, or eye_in_hand."
-            self._refuse("it is no CSV file; samples of a program for hand-eye calibration are read as pairs.", hint)
-        mapped = {f"{instance}.{name}": own for name, own in self._orientation.mapped().items()}
-        columns = {**s.columns, **mapped}
+            refuse(s.path, "it is no CSV file; samples of a program for hand-eye calibration are read as pairs.", hint)
+        names = [f"{instance}.{name}" for name in self._orientation.names]
+        columns = {**s.columns, **dict(zip(names, self._orientation.columns, strict=True))}
         reader = CsvReader(CsvSettings(path=s.path, columns=columns, delimiter=s.delimiter, decimal=s.decimal))
         # the file's numbers in place of the quaternion; they cannot be absent
         quaternion = {f"{instance}.{name}" for name in QUATERNION}
         rest = [channel for channel in request.channels if channel.channel not in quaternion]
-        own = [RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in mapped]
+        own = [RequestedChannel(name, (name,), DIMENSIONLESS, True, parts=(instance,)) for name in names]
         dataset = reader.read(replace(request, channels=(*rest, *own)))
-        dataset = self._without_faulty(dataset, tuple(mapped))
-        values = dataset.stacked(tuple(mapped)).T
+        dataset = self._without_faulty(dataset, names)
+        values = dataset.stacked(names).T
         made = np.flatnonzero(~np.isnan(values).any(axis=1))
-        mirrored = reflections(values[made])
+        mirrored = np.flatnonzero(np.linalg.det(values[made].reshape(-1, 3, 3)) < 0) if s.rotation else made[:0]
         if mirrored.size:
             text = f"found {mirrored.size} of {len(made)} rotation matrices that are reflections (determinant -1)."
             hint = "Check the order and signs of the columns, and that the frames are right-handed."
-            self._refuse(text, hint, dataset.rows[made[mirrored[0]]])
+            refuse(s.path, text, hint, dataset.rows[made[mirrored[0]]])
         self._refuse_other_meaning(dataset.subset(made), request, instance, values[made])
-        return self._with_quaternions(dataset, instance, values, made)
+        return self._with_quaternions(dataset, instance, names, values, made)
 
     def _instance(self, request: ReadRequest) -> str:
         reading = [name for name, m in request.measurements.items() if {c.name for c in m.channels()} >= {*QUATERNION}]
         named = self._settings.measurement
         if named in reading or (named is None and len(reading) == 1):
             return named or reading[0]
-        self._refuse(
+        refuse(
+            self._settings.path,
             f"found {', '.join(reading) or 'no measurement'} to read orientations, expected {named or 'one'}.",
             "Add a measurement tip_pose, or set measurement: NAME in the data section.",
         )
 
-    def _without_faulty(self, dataset: Dataset, channels: tuple[str, ...]) -> Dataset:
+    def _without_faulty(self, dataset: Dataset, channels: Sequence[str]) -> Dataset:
         """Set aside what is no rotation; refuse the file if that is more than a few."""
-        values, kind = dataset.stacked(channels).T, self._orientation.kind
+        values, kind, path = dataset.stacked(channels).T, self._orientation.kind, self._settings.path
         made = ~np.isnan(values).any(axis=1)
-        off, size = self._orientation.fault(values), self._orientation.size(values)
-        zero, wrong = made & (size < _ZERO), made & (size >= _ZERO) & (off > TOLERANCE)
+        off, is_zero = self._orientation.fault(values), np.abs(values).max(axis=1) < _ZERO
+        wrong = made & (off > TOLERANCE) & ~is_zero
         if wrong.sum() > MOST_FAULTY * made.sum():
             first = int(np.flatnonzero(wrong)[0])
             text = f"found {wrong.sum()} of {made.sum()} orientations that are no {kind}, the first off by"
             hint = "Check that the columns are those of the orientation, and in this order."
-            self._refuse(f"{text} {off[first]:.3g} (more than {TOLERANCE:g}).", hint, dataset.rows[first])
-        faulty = {int(i): f"its {kind} is zero" for i in np.flatnonzero(zero)}
+            refuse(path, f"{text} {off[first]:.3g} (more than {TOLERANCE:g}).", hint, dataset.rows[first])
+        faulty = {int(i): f"its {kind} is zero" for i in np.flatnonzero(made & (off > TOLERANCE) & is_zero)}
         faulty |= {int(i): f"its {kind} is off by {off[i]:.3g}" for i in np.flatnonzero(wrong)}
         return require_records(
             set_aside(dataset, Layout(by_line=True), faulty, f"the {kind} is none", "Measure these again.")
@@ -486,19 +451,21 @@ class PoseCsvReader:
         others = {name: np.degrees(misfit(r, nominal)) for name, r in self._orientation.others(values).items()}
         best = min(others, key=lambda name: others[name])
         if any(declared > worst and declared > times * others[best] for worst, times in WORST):
-            self._refuse(
+            refuse(
+                self._settings.path,
                 f"orientations turn unlike the nominal arm: with {self._orientation.declared} the turns between "
                 f"records are off by {declared:.2f} deg (median), with {best} by {others[best]:.2f} deg.",
                 "Correct the order of the columns, or give base_T_body's orientation.",
             )
 
-    def _with_quaternions(self, dataset: Dataset, instance: str, values: Array, made: Array) -> Dataset:
+    def _with_quaternions(
+        self, dataset: Dataset, instance: str, given: Sequence[str], values: Array, made: Indices
+    ) -> Dataset:
         """Unit quaternions, of a sign that does not jump back and forth for nothing."""
         quaternions = np.full((len(dataset), 4), np.nan)
         quaternions[made] = self._orientation.rotations(values[made]).as_quat()[:, [3, 0, 1, 2]]
         negative = quaternions[:, 0] < 0
         quaternions[negative] *= -1
-        given = {f"{instance}.{name}" for name in self._orientation.mapped()}
         channels = {name: numbers for name, numbers in dataset.channels.items() if name not in given}
         channels |= {f"{instance}.{name}": quaternions[:, i] for i, name in enumerate(QUATERNION)}
         dataset = replace(dataset, channels=channels)
@@ -508,9 +475,6 @@ class PoseCsvReader:
             f"{negative.sum()} of {len(made)} quaternions had qw below 0 and were negated, which is the same rotation."
         )
         return warned(dataset, text)
-
-    def _refuse(self, message: str, hint: str, line: int | None = None) -> NoReturn:
-        raise DataError(message, where=Location(str(self._settings.path), line=line), hint=hint)
 
 
 def nominal_rotations(arm: Arm, dataset: Dataset) -> Rotation:

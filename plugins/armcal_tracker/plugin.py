@@ -18,7 +18,5 @@ def armcal_register_readers(register: Register) -> None:
 
 @hookimpl
 def armcal_register_trackers(register: Register) -> None:
-    register("dtrack", "armcal_tracker.dtrack:DTrackTracker", "DTrack's ASCII output over UDP")
-    register(
-        "json_lines", "armcal_tracker.line_trackers:JsonLinesTracker", "a JSON object a line: UDP, or a growing file"
-    )
+    register("dtrack", "armcal_tracker.trackers:DTrackTracker", "DTrack's ASCII output over UDP")
+    register("json_lines", "armcal_tracker.trackers:JsonLinesTracker", "a JSON object a line: UDP, or a growing file")

@@ -68,7 +68,8 @@ class PosePairsReader:
             markers = np.linalg.inv(markers)
         _refuse_other_lengths(path, hands, markers)
         body = Rotation.from_matrix(markers[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
-        columns = {f"{arm}.{name}": column for name, column in zip(_FLANGE, _flange(hands), strict=True)}
+        flange = [*hands[:, :3, 3].T, *hand.as_euler("ZYX").T]
+        columns = {f"{arm}.{name}": column for name, column in zip(_FLANGE, flange, strict=True)}
         columns |= {f"{reading[0]}.{axis}": markers[:, i, 3] for i, axis in enumerate("xyz")}
         columns |= {f"{reading[0]}.{name}": body[:, i] for i, name in enumerate(QUATERNION)}
         numbers = tuple(range(1, len(hands) + 1))
@@ -132,11 +133,6 @@ def _refuse_other_lengths(path: Any, hands: Array, markers: Array) -> None:
     off, before = (1000 * math.sqrt(square / count) for square in (left, kept))
     hint = "Correct the size of the marker by this factor, or the unit of one of both: all places are in m."
     refuse(path, f"{text} {off:.3g} mm, by {before:.3g} mm as they stand.", hint)
-
-
-def _flange(hands: Array) -> list[Array]:
-    angles = Rotation.from_matrix(hands[:, :3, :3]).as_euler("ZYX")
-    return [*hands[:, :3, 3].T, *angles.T]
 
 
 def _pairs(path: Any, content: bytes) -> tuple[Array, Array]:

@@ -130,7 +130,7 @@ class TipPose(TipPosition):
         return super().channels() + tuple(Channel(name, "dimensionless") for name in _QUATERNION)
 
     def outputs(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
-        """The body's pose in the base frame (m, unit quaternion with qw >= 0)."""
+        # a unit quaternion with qw >= 0
         base_T_body = self._pose(arms, values)
         quaternion = quaternion_expression(base_T_body.rotation)
         quaternion = ca.if_else(quaternion[0] < 0, -quaternion, quaternion)
@@ -151,7 +151,6 @@ class TipPose(TipPosition):
         return ca.vertcat(position - predicted.translation, turned)
 
     def noise(self) -> tuple[float, ...]:
-        """Of each coordinate (m) and of each entry of the rotation vector (rad)."""
         return super().noise() + three(self.settings.orientation_noise)
 
     def dimensions(self) -> tuple[str, ...]:

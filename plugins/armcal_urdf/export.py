@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, ClassVar
 
@@ -19,7 +18,7 @@ from armcal.errors import ConfigError, ProblemError
 from scipy.spatial.transform import Rotation
 
 from armcal_urdf.model import RPY, XYZ, ChainJoint, UrdfModel, UrdfSettings, turned
-from armcal_urdf.robot import UTF8, Three, UrdfJoint, encode, words_of
+from armcal_urdf.robot import UTF8, Three, UrdfJoint, words_of
 
 _ROUNDING = 1e-13  # m or rad: what a solver leaves of a number that nothing moved
 _WHITE = b" \t\r\n"
@@ -27,27 +26,13 @@ _ATTRIBUTE = re.compile(rb"""\s+(?P<name>[^\s=/>]+)\s*=\s*(?P<value>"[^"]*"|'[^'
 _START_TAG = re.compile(rb"""(?P<name><[^\s/>]+)(?:\s+[^\s=/>]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""")
 
 
-@dataclass(frozen=True)
-class Placed:
-    """A joint and where it stands now: xyz (m) and rpy (rad)."""
-
-    joint: UrdfJoint
-    xyz: Three
-    rpy: Three
-
-    @property
-    def changed(self) -> Mapping[str, Three]:
-        pairs = {"xyz": (self.joint.xyz, self.xyz), "rpy": (self.joint.rpy, self.rpy)}
-        return {name: now for name, (before, now) in pairs.items() if before != now}
-
-
 Edit = tuple[int, int, bytes]  # Bytes from an offset to before another become new ones
 
 
-def with_origins(text: str, placed: Iterable[Placed]) -> str:
-    """The text with other origins of joints; ``placed`` has joints that were read from this very text."""
+def _with_origins(text: str, placed: Iterable[tuple[UrdfJoint, Mapping[str, Three]]]) -> str:
+    """The text with other ``xyz`` (m) and ``rpy`` (rad) of joints, which were read from this very text."""
     data = text.encode(UTF8)
-    edits = sorted((edit for joint in placed for edit in _edits(data, joint)), key=itemgetter(0))
+    edits = sorted((edit for joint, now in placed for edit in _edits(data, joint, now)), key=itemgetter(0))
     parts, here = [], 0
     for start, end, new in edits:
         parts += [data[here:start], new]
@@ -55,9 +40,9 @@ def with_origins(text: str, placed: Iterable[Placed]) -> str:
     return b"".join([*parts, data[here:]]).decode(UTF8)
 
 
-def _edits(data: bytes, placed: Placed) -> list[Edit]:
-    element, changed = placed.joint.element, placed.changed
-    origin = element.one("origin")
+def _edits(data: bytes, joint: UrdfJoint, now: Mapping[str, Three]) -> list[Edit]:
+    changed = {name: numbers for name, numbers in now.items() if numbers != getattr(joint, name)}
+    element, origin = joint.element, joint.element.one("origin")
     if not changed:
         return []
     if origin is None:
@@ -112,12 +97,7 @@ class UrdfExporter:
         self._settings = settings
 
     def export(self, request: ExportRequest) -> Exported:
-        """The URDF, read again and compared.
-
-        Raises:
-            ConfigError: the arm's model is not a URDF.
-            ProblemError: the URDF with the new numbers is not the calibrated arm.
-        """
+        """The URDF, read again and compared with the calibrated arm."""
         model = request.arm.model
         if not isinstance(model, UrdfModel):
             raise ConfigError(
@@ -127,25 +107,22 @@ class UrdfExporter:
         scope = f"{request.name}.{request.arm.model_name}."
         values = {n.removeprefix(scope): float(v[0]) for n, v in request.values.items() if n.startswith(scope)}
         placed = [
-            Placed(joint.urdf, _three(joint.name, XYZ, values), _rpy(joint, model.settings, values))
+            (joint.urdf, {"xyz": _three(joint.name, XYZ, values), "rpy": _rpy(joint, model.settings, values)})
             for joint in model.urdf_chain.joints
         ]
         old = model.settings
-        text = with_origins(old.text, placed)
+        text = _with_origins(old.text, placed)
         written = UrdfModel(UrdfSettings.model_validate({**old.to_config(), "text": text}))
         _require_same_frames(request.arm, model, written, values)
-        changed = sum(
-            before != now
-            for joint in placed
-            for before, now in zip((*joint.joint.xyz, *joint.joint.rpy), (*joint.xyz, *joint.rpy), strict=True)
-        )
+        pairs = [(getattr(joint, name), numbers) for joint, now in placed for name, numbers in now.items()]
+        changed = sum(one != other for before, after in pairs for one, other in zip(before, after, strict=True))
         # what of the calibrated arm is no origin of a joint
         nominal = {block.name: block.nominal for block in request.arm.parameters()}
         moved = [name for name, value in request.values.items() if tuple(value) != nominal[name]]
         masses = sorted({name.split(".")[2] for name in moved if name.startswith(f"{request.name}.links.")})
         left_out = (*request.arm.effects, *(f"the mass of {link}" for link in masses))
         remarks = _placed(request) or _base_moved(model, values)
-        return Exported(encode(text, old.encoding or "utf-8"), changed, left_out, remarks=remarks)
+        return Exported(text.encode(old.encoding or "utf-8"), changed, left_out, remarks=remarks)
 
 
 def _three(joint: str, names: tuple[str, ...], values: Mapping[str, float]) -> Three:

@@ -18,27 +18,13 @@ from armcal.base.settings import InputPath, Settings
 from pydantic import model_validator
 from scipy.spatial.transform import Rotation
 
-from armcal_urdf.robot import (
-    FREE,
-    MAX_BYTES,
-    MOVING,
-    Encoding,
-    Robot,
-    Three,
-    UrdfJoint,
-    declared,
-    encode,
-    read_robot,
-    read_text,
-)
+from armcal_urdf.robot import FREE, MAX_BYTES, MOVING, Encoding, Robot, Three, UrdfJoint, read_robot, read_text
 
 _UNFIT = re.compile(r"[^A-Za-z0-9_-]")
 
 
 @dataclass(frozen=True)
 class ChainJoint:
-    """A joint of the chain."""
-
     name: str  # as parameters and records call it
     frame: str  # what the frame of the link behind it is called
     mimic: Mimic | None  # the independent joint that it follows, by its name here
@@ -51,11 +37,9 @@ class ChainJoint:
 
 @dataclass(frozen=True)
 class UrdfChain:
-    """A chain: the frame of the link that it stands on, its joints, and the masses that these move."""
-
-    root_frame: str
+    root_frame: str  # of the link that it stands on
     joints: tuple[ChainJoint, ...]
-    masses: tuple[MassSpec, ...]
+    masses: tuple[MassSpec, ...]  # that the joints move
 
     @property
     def moving(self) -> tuple[ChainJoint, ...]:
@@ -63,12 +47,7 @@ class UrdfChain:
 
 
 def chain_of(robot: Robot, root: str | None, tip: str | None) -> UrdfChain:
-    """The chain from a link (None: the tree's root) out to another (None: the only leaf).
-
-    Raises:
-        ValueError: no such link, no such path, or several leaves.
-        ConfigError: a joint on the path is none that a chain can have; with file and line.
-    """
+    """The chain from a link (None: the tree's root) out to another (None: the only leaf)."""
     root, tip = ends(robot, root, tip)
     path = robot.path(root, tip) or ()
     for joint in path:
@@ -88,11 +67,6 @@ def chain_of(robot: Robot, root: str | None, tip: str | None) -> UrdfChain:
 
 
 def ends(robot: Robot, root: str | None, tip: str | None) -> tuple[str, str]:
-    """Root and tip by name.
-
-    Raises:
-        ValueError: no such link, the tip is not beyond the root, or several leaves.
-    """
     for name, link in (("root", root), ("tip", tip)):
         if link is not None and link not in robot.links:
             raise ValueError(f"{name}: no link is called {link!r}; the links are {', '.join(robot.links)}")
@@ -108,11 +82,7 @@ def ends(robot: Robot, root: str | None, tip: str | None) -> tuple[str, str]:
 
 
 def frame_names(links: list[str]) -> Mapping[str, str]:
-    """What the frames of links are called: armcal has a mount and a tool of its own.
-
-    Raises:
-        ValueError: two links would share a name.
-    """
+    """What the frames of links are called: armcal has a mount and a tool of its own."""
     renamed = {name: f"{name}_link" for name in (MOUNT_FRAME, TOOL_FRAME)}
     fitting = {link: renamed.get(name, name) for link, name in _fitting("link", links).items()}
     return _different("link", fitting)
@@ -251,9 +221,9 @@ class UrdfSettings(Settings):
             content["text"], content["encoding"] = read_text(self.path)
             content["file"] = self.path.name
         elif self.encoding is None:
-            content["encoding"] = declared(self.text, label) or "utf-8"
+            content["encoding"] = "utf-8"
         robot = read_robot(content["text"], label)
-        encode(content["text"], content.get("encoding") or self.encoding or "utf-8")
+        content["text"].encode(content.get("encoding") or self.encoding)
         content["root"], content["tip"] = ends(robot, self.root, self.tip)
         for name, value in content.items():
             object.__setattr__(self, name, value)
@@ -299,7 +269,7 @@ class UrdfSettings(Settings):
 
     @property
     def content(self) -> bytes:
-        return encode(self.text, self.encoding or "utf-8")
+        return self.text.encode(self.encoding or "utf-8")
 
 
 def turned(rpy: Three, angle: float) -> Three:
@@ -332,7 +302,6 @@ class UrdfModel:
         return tuple(joint.name for joint in self.urdf_chain.moving)
 
     def parameters(self) -> tuple[ParameterBlock, ...]:
-        """The origins of all joints on the chain: xyz (m) and rpy (rad)."""
         blocks: list[ParameterBlock] = []
         for joint in self.urdf_chain.joints:
             xyz = zip(XYZ, joint.urdf.xyz, strict=True)
@@ -345,7 +314,6 @@ class UrdfModel:
         return self.urdf_chain.masses if self.settings.inertials == "use" else ()
 
     def chain(self, values: Mapping[str, Any]) -> Chain:
-        """Origins and motions in turn; every link is a frame."""
         joints: list[Joint] = []
         frames = {self.urdf_chain.root_frame: Attachment(0, se3.identity())}
         here = se3.identity()

@@ -8,7 +8,6 @@ comments are passed over.
 
 from __future__ import annotations
 
-import codecs
 import difflib
 import math
 import re
@@ -16,106 +15,39 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Literal, NoReturn, get_args
+from typing import Literal, NoReturn
 from xml.parsers import expat
 
 from armcal.arm.model import Mimic
 from armcal.errors import ConfigError, Location
 from armcal.io.plain_files import input_bytes
 
-Encoding = Literal["utf-8", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
+Encoding = Literal["utf-8", "iso-8859-1"]
 
 MAX_BYTES = 256 * 1024  # Of a URDF: a calibration holds it whole, and may have four times as many itself
 _MOST = 1 << 26  # Read at all, so that what is too large is refused with the reason
-_MARKS: tuple[tuple[bytes, Encoding], ...] = (
-    (codecs.BOM_UTF8, "utf-8"),
-    (codecs.BOM_UTF16_LE, "utf-16-le"),
-    (codecs.BOM_UTF16_BE, "utf-16-be"),
-    (b"<\0", "utf-16-le"),
-    (b"\0<", "utf-16-be"),
-)
-_DECLARED = re.compile(r"""\ufeff?<\?xml\s[^>]*?encoding\s*=\s*["']([^"'>]*)["']""")
-_OTHER_NAMES: dict[str, Encoding] = {
-    "utf8": "utf-8",
-    "ascii": "us-ascii",
-    "latin-1": "iso-8859-1",
-    "latin1": "iso-8859-1",
-}
 
 
 def read_text(path: Path) -> tuple[str, Encoding]:
-    """The text of a file and its encoding.
-
-    Raises:
-        ConfigError: it cannot be read, is too large, or is not in the encoding that it declares.
-    """
     return decode(input_bytes(path, _MOST, "a URDF file", ConfigError), str(path))
 
 
 def decode(data: bytes, label: str) -> tuple[str, Encoding]:
-    """Text and encoding; ``encode`` gives the same bytes back.
-
-    Raises:
-        ConfigError: too large, of an encoding that is not known, or not in the one it declares.
-    """
+    """Text and encoding: UTF-8, or Latin-1 where it is none, whatever the first line declares."""
     if len(data) > MAX_BYTES:
         raise ConfigError(
             f"the file is larger than {MAX_BYTES // 1024} KiB, which a calibration could not hold.",
             where=Location(label),
             hint="Keep meshes in files of their own, and leave out what is not the arm.",
         )
-    encoding = next((name for mark, name in _MARKS if data.startswith(mark)), None)
-    encoding = encoding or declared(data[:200].decode("iso-8859-1"), label) or "utf-8"
     try:
-        return data.decode(encoding), encoding
-    except UnicodeDecodeError as fault:
-        line = data.count(b"\n", 0, fault.start) + 1
-        raise ConfigError(
-            f"the bytes at offset {fault.start} are not {encoding}.",
-            where=Location(label, line),
-            hint="Save the file as UTF-8, or declare its encoding in the first line.",
-        ) from fault
+        return data.decode("utf-8"), "utf-8"
+    except UnicodeDecodeError:
+        return data.decode("iso-8859-1"), "iso-8859-1"
 
 
-def declared(text: str, label: str) -> Encoding | None:
-    """The encoding that the text's first line declares, None if it declares none.
-
-    UTF-16 cannot be recognised by the declaration alone, and a declaration of it in another encoding is wrong.
-
-    Raises:
-        ConfigError: it is not one of those known.
-    """
-    match = _DECLARED.match(text)
-    if match is None:
-        return None
-    name = match[1].lower()
-    name = _OTHER_NAMES.get(name, name)
-    known = {encoding: encoding for encoding in get_args(Encoding)}
-    if name not in known or name.startswith("utf-16"):
-        raise ConfigError(
-            f"found the encoding {match[1]!r}, expected UTF-8, UTF-16, ISO-8859-1 or US-ASCII and a text in it.",
-            where=Location(label, 1),
-            hint="Save the file as UTF-8.",
-        )
-    result: Encoding = known[name]
-    return result
-
-
-def encode(text: str, encoding: Encoding) -> bytes:
-    """The bytes of a text.
-
-    Raises:
-        ValueError: it holds a character that the encoding has not.
-    """
-    try:
-        return text.encode(encoding)
-    except UnicodeEncodeError as fault:
-        line = text.count("\n", 0, fault.start) + 1
-        raise ValueError(f"line {line} of the URDF holds {text[fault.start]!r}, which {encoding} has not") from fault
-
-
-MAX_DEPTH = 50
 UTF8 = "utf-8"
 Three = tuple[float, float, float]
 
@@ -128,8 +60,6 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class Element:
-    """One element."""
-
     tag: str  # its name
     attributes: Mapping[str, str]  # values by name, references expanded
     line: int  # of its start tag, from 1
@@ -141,22 +71,13 @@ class Element:
         return (child for child in self.children if child.tag == tag)
 
     def one(self, tag: str) -> Element | None:
-        """The child of a name; None if there is none.
-
-        Raises:
-            ConfigError: it stands twice.
-        """
         elements = list(self.all(tag))
         if len(elements) > 1:
             elements[1].refuse(f"found <{tag}> twice in one <{self.tag}>.", f"The first is at line {elements[0].line}.")
         return elements[0] if elements else None
 
     def text(self, name: str) -> str:
-        """An attribute that has to be there and hold something.
-
-        Raises:
-            ConfigError: it is missing or empty.
-        """
+        """An attribute that has to be there and hold something."""
         value = self.attributes.get(name, "")
         if not value.strip():
             which = "an empty" if name in self.attributes else "no"
@@ -168,21 +89,10 @@ class Element:
 
 
 def read_elements(text: str, label: str) -> Element:
-    """The root element of a text.
-
-    Raises:
-        ConfigError: not well-formed, a document type, or nested too deeply; with file and line.
-    """
-    try:
-        data = text.encode(UTF8)
-    except UnicodeEncodeError as fault:
-        line = text.count("\n", 0, fault.start) + 1
-        hint = "Delete it."
-        raise ConfigError("found half a surrogate pair.", where=Location(label or None, line), hint=hint) from fault
     parser = expat.ParserCreate(UTF8)
     builder = _Builder(parser, label, is_expanded="${" not in text)
     try:
-        parser.Parse(data, True)
+        parser.Parse(text.encode(UTF8), True)
     except expat.ExpatError as fault:
         raise ConfigError(
             f"this is not well-formed XML: {expat.ErrorString(fault.code)}.",
@@ -208,8 +118,6 @@ class _Builder:
         element = Element(tag, attributes, line, start, self._label)
         if tag.startswith("xacro:") and not (tag == _PROPERTY and self._is_expanded):
             element.refuse(f"found <{tag}>: this is xacro, not yet a URDF.", "Run it through xacro first.")
-        if len(self._open) >= MAX_DEPTH:
-            element.refuse(f"elements are nested deeper than {MAX_DEPTH} levels.", "A URDF needs five.")
         (self._open[-1].children if self._open else self.root).append(element)
         self._open.append(element)
 
@@ -229,20 +137,10 @@ def words_of(value: str) -> list[str]:
 
 
 def number(element: Element, name: str, default: float, largest: float = LARGEST) -> float:
-    """One number; the default where there is no such attribute.
-
-    Raises:
-        ConfigError: not one number.
-    """
     return numbers(element, name, (default,), largest)[0]
 
 
 def three(element: Element | None, name: str, default: Three = (0.0, 0.0, 0.0)) -> Three:
-    """Three numbers; the default where there is no such element or attribute.
-
-    Raises:
-        ConfigError: not three numbers.
-    """
     if element is None:
         return default
     x, y, z = numbers(element, name, default, LARGEST)
@@ -250,11 +148,7 @@ def three(element: Element | None, name: str, default: Three = (0.0, 0.0, 0.0)) 
 
 
 def numbers(element: Element, name: str, default: tuple[float, ...], largest: float) -> tuple[float, ...]:
-    """As many numbers as the default has.
-
-    Raises:
-        ConfigError: another count, or what is no finite decimal number of typical size.
-    """
+    """As many numbers as the default has."""
     if name not in element.attributes:
         return default
     words = words_of(element.attributes[name])
@@ -277,11 +171,7 @@ def numbers(element: Element, name: str, default: tuple[float, ...], largest: fl
 
 
 def unit_axis(element: Element | None) -> Three:
-    """The direction of an <axis>, of length one; x where there is none, by the format.
-
-    Raises:
-        ConfigError: there are none in it, not three, or all zero.
-    """
+    """The direction of an <axis>, of length one; x where there is none, by the format."""
     if element is not None:
         element.text("xyz")
     x, y, z = three(element, "xyz", (1.0, 0.0, 0.0))
@@ -312,18 +202,14 @@ _ANY = sys.float_info.max
 
 @dataclass(frozen=True)
 class UrdfLink:
-    """A link: its mass (kg, 0 where none is stated) and the mass's centre in the link's frame (m)."""
-
     name: str
-    mass: float
-    com: Three
+    mass: float  # kg, 0 where none is stated
+    com: Three  # the mass's centre in the link's frame (m)
     element: Element
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint."""
-
     name: str  # as written
     kind: str  # ``revolute``, ``continuous``, ``prismatic``, ``fixed``, ``floating`` or ``planar``
     parent: str  # link it stands on
@@ -380,15 +266,7 @@ class Robot:
 
 
 def read_robot(text: str, label: str) -> Robot:
-    """The links and joints of a URDF.
-
-    Args:
-        text: the URDF.
-        label: the file's name, for messages.
-
-    Raises:
-        ConfigError: it is no URDF, or describes what cannot be; with file and line.
-    """
+    """The links and joints of a URDF; ``label`` is the file's name, for messages."""
     top = read_elements(text, label)
     if top.tag != "robot":
         top.refuse(f"found <{top.tag}> at the top, expected <robot>.", "Give a URDF file.")
@@ -403,7 +281,7 @@ def read_robot(text: str, label: str) -> Robot:
     if not links:
         top.refuse("found no <link> in <robot>, expected links and joints.", "Give a whole URDF.")
     robot = Robot(links, joints, tuple(dict.fromkeys(_ignored(top))))
-    _require_tree(robot, top)
+    _require_tree(robot)
     return robot
 
 
@@ -511,7 +389,7 @@ def _refuse_alike(element: Element, text: str, name: str, known: tuple[str, ...]
         element.refuse(f"found {text}, which nothing reads.", f"Did you mean {near[0]}?")
 
 
-def _require_tree(robot: Robot, top: Element) -> None:
+def _require_tree(robot: Robot) -> None:
     carried: dict[str, UrdfJoint] = {}
     for joint in robot.joints.values():
         for which, link in (("parent", joint.parent), ("child", joint.child)):
@@ -533,23 +411,10 @@ def _require_tree(robot: Robot, top: Element) -> None:
             f"found {len(roots)} links that no joint carries ({', '.join(roots[:5])}), expected one root.",
             "Join them, or remove what does not belong to the arm.",
         )
-    _refuse_circle(robot, roots[0] if roots else None, top)
-
-
-def _refuse_circle(robot: Robot, root: str | None, top: Element) -> None:
-    reached: set[str] = set()
-    waiting = [root] if root is not None else []
-    while waiting:
-        link = waiting.pop()
-        reached.add(link)
-        waiting += [joint.child for joint in robot.below[link]]
-    beyond = [joint for joint in robot.joints.values() if joint.child not in reached]
-    if beyond:
-        circle = [beyond[0].name]
-        here = robot.above[beyond[0].parent]
-        while here.name not in circle:
-            circle.append(here.name)
-            here = robot.above[here.parent]
-        beyond[0].element.refuse(
-            f"joints go round in a circle: {', '.join(reversed(circle))}.", "A URDF is a tree; remove one of them."
-        )
+    try:
+        TopologicalSorter({joint.child: [joint.parent] for joint in robot.joints.values()}).prepare()
+    except CycleError as fault:
+        circle = [robot.above[link] for link in fault.args[1][1:]]
+        names = ", ".join(joint.name for joint in circle)
+        first = min(circle, key=lambda joint: joint.element.line).element
+        first.refuse(f"joints go round in a circle: {names}.", "A URDF is a tree; remove one of them.")

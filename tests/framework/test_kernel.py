@@ -137,7 +137,7 @@ def assert_same(one, two, tolerance=AGREEMENT):
 
 
 def test_every_operation_that_the_writer_knows_has_an_expression_here():
-    known = set(c_source._BINARY) | set(c_source._UNARY) | set(c_source._FUNCTIONS)
+    known = set(c_source._OPERATORS) | set(c_source._FUNCTIONS)
     assert known - {"ASSIGN"} == set(OPERATIONS)  # casadi's scalar expressions hold no assignments
 
 

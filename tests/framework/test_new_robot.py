@@ -540,7 +540,7 @@ URDFS = {
     "no joint": ('<robot name="r"><link name="a"/></robot>', "moves"),
     "one joint": (URDF.format(JOINT.format("continuous", "")), "found 1 moving joints"),
     "no XML": ("<robot", "not well-formed XML"),
-    "no text": (b"\xff\xfe\xfa", "bytes"),
+    "no text": (b"\xff\xfe\xfa", "not well-formed XML"),
 }
 
 

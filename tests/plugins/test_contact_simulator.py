@@ -16,7 +16,7 @@ from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.measure.tables import write_csv
 from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import ClampedTool, PlaneContact
-from armcal_dualarm.closure import ClosedChain
+from armcal_dualarm.two_arms import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
 from armcal_simulation.simulators import ContactsSettings, ContactsSimulator
 from armcal_tracker.csv_reader import CsvReader, CsvSettings

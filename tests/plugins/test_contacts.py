@@ -13,7 +13,7 @@ from armcal.estimate.identifiability import require_solvable
 from armcal.estimate.polish import restricted, settled, started, untrained
 from armcal.problem.variants import with_joint_noise
 from armcal_contact.contacts import BallInSocket, ClampedTool, PlaneContact
-from armcal_dualarm.closure import ClosedChain
+from armcal_dualarm.two_arms import ClosedChain
 from armcal_ipopt.estimator import IpoptEstimator
 from contact_oracle import LEFT
 from scipy.optimize import least_squares

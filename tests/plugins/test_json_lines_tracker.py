@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from armcal.devices.clock import RealClock
 from armcal.devices.device import DeviceRefusedError
-from armcal_tracker.frames import UnreadableError
-from armcal_tracker.line_trackers import JsonLinesSettings, JsonLinesTracker, json_frame
+from armcal_tracker.trackers import JsonLinesSettings, JsonLinesTracker, UnreadableError, json_frame
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -72,8 +71,6 @@ def test_a_quaternion_that_is_none_loses_the_body(body: object) -> None:
         '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "p_m": [1, 2, 3]}}}',
         '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "q": [1, 0, 0]}}}',
         '{"frame": 1, "bodies": {"tool": {"p_mm": [1, 2, 3], "r": 1}}}',
-        json.dumps({"frame": 1, "bodies": {"x" * 200: None}}),
-        json.dumps({"frame": 1, "bodies": dict.fromkeys(map(str, range(200)))}),
         '{"frame": 1, "bodies": ' + '{"a":' * 9000 + "1" + "}" * 9000 + "}",
         "[" * 60000,
     ],
@@ -106,7 +103,6 @@ def test_datagrams_of_lines() -> None:
             sender.sendto(data, tracker.address)
     assert [f.counter for f in tracker.frames()] == [1, 2, 3, 4, 5, 9]
     assert sum(tracker.refused.values()) == 2
-    assert tracker.missing == 3
     with pytest.raises(DeviceRefusedError):
         JsonLinesTracker(JsonLinesSettings(port=tracker.address[1])).open(RealClock())
     tracker.close()

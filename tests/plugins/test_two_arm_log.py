@@ -11,8 +11,7 @@ from armcal.errors import ArmcalError, DataError
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal.measure.rests import StillSettings, rests
 from armcal_contact.contacts import BallInSocket, BallInSocketSettings
-from armcal_dualarm.closure import ClosedChain, ClosedChainSettings
-from armcal_dualarm.log_reader import TwoArmLogReader, TwoArmLogSettings
+from armcal_dualarm.two_arms import ClosedChain, ClosedChainSettings, TwoArmLogReader, TwoArmLogSettings
 from armcal_mdh.model import MdhModel, MdhSettings
 from pydantic import ValidationError
 

@@ -24,7 +24,7 @@ from armcal.run.experiment import Experiment
 from armcal.run.plan import stated_beyond
 from armcal_joints.effects import ServoMap
 from armcal_urdf.model import UrdfModel, UrdfSettings
-from armcal_urdf.robot import MAX_BYTES, decode, encode
+from armcal_urdf.robot import MAX_BYTES
 from holding import holding_efforts
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -398,12 +398,10 @@ def test_the_tip_must_be_said_where_the_tree_ends_in_several():
 # The file, kept whole
 
 
-@pytest.mark.parametrize(
-    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "iso-8859-1", "us-ascii"]
-)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "iso-8859-1", "us-ascii"])
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r"])
 def test_a_calibration_holds_the_file_byte_for_byte(tmp_path, encoding, newline):
-    declared = "utf-8" if encoding == "utf-8-sig" else encoding.removesuffix("-le").removesuffix("-be")
+    declared = "utf-8" if encoding == "utf-8-sig" else encoding
     special = "tab\t quotes '\" # : - \\n %" + ("" if encoding == "us-ascii" else " \x85 ä é")
     text = ODD.replace('<?xml version="1.0"?>', f'<?xml version="1.0" encoding="{declared}"?>')
     text = text.replace("<link name=", f"<!-- {special} -->\n\t <link name=", 3).replace("\n", newline) + newline * 2
@@ -449,7 +447,6 @@ def test_any_text_survives_yaml(seed):
     for _ in range(200):
         text = "".join(random.choice(signs, random.integers(1, 60)))
         assert yaml.safe_load(dump({"text": text}))["text"] == text
-        assert decode(encode("\ufeff" + text, "utf-16-be"), "x") == ("\ufeff" + text, "utf-16-be")
 
 
 def test_faults_of_a_file_name_the_file_and_the_line(tmp_path):
@@ -465,9 +462,7 @@ def test_files_that_cannot_be_read_are_refused(tmp_path):
     for name, content, match in (
         ("missing", None, "there is no such file"),
         ("large", b" " * (MAX_BYTES + 1), "larger than 256 KiB"),
-        ("latin", b'<?xml version="1.0"?><robot name="\xe9"/>', "are not utf-8"),
-        ("other", b'<?xml version="1.0" encoding="EBCDIC"?><robot/>', "found the encoding 'EBCDIC'"),
-        ("lies", b'<?xml version="1.0" encoding="UTF-16"?><robot/>', "found the encoding 'UTF-16'"),
+        ("wide", '<?xml version="1.0"?><robot/>'.encode("utf-16"), "not well-formed XML"),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)

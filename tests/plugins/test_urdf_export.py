@@ -78,7 +78,6 @@ SOURCES = {
     "as it is": STRANGE.encode(),
     "line ends of Windows": STRANGE.replace("\n", "\r\n").encode(),
     "a byte order mark": STRANGE.encode("utf-8-sig"),
-    "UTF-16": STRANGE.encode("utf-16"),
     "Latin-1": STRANGE.replace(" 😀", "").replace("?>", " encoding='latin1'?>", 1).encode("latin1"),
 }
 

@@ -1,13 +1,10 @@
-"""An arm: a model, its effects and its masses, put together under one instance name.
-
-The elastic state of an arm: what its springs give at each site, as few numbers as they need.
+"""An arm: a model, its effects and its masses, put together under one instance name; and its elastic state.
 
 Springs that share a site share its coordinates: their deflections add up.
 """
 
-import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -16,18 +13,9 @@ import casadi as ca
 import numpy as np
 
 from armcal.arm.effects import MOUNT, XYZ, Condition, JointCommand, JointEffect, Spring, check_springs
-from armcal.arm.model import ArmModel, Chain, Frames, Joint, Vector3, check_chain, forward
+from armcal.arm.model import ArmModel, Chain, Frames, Joint, Mimic, Vector3, check_chain, forward
 from armcal.arm.pose_residual import OF_TOOL, SURROUNDINGS, PoseResidual, Postures, corrected, correction_names
-from armcal.arm.statics import (
-    LOAD_CHANNELS,
-    Environment,
-    Load,
-    MassSpec,
-    SiteWrench,
-    effort,
-    joint_efforts,
-    wrenches,
-)
+from armcal.arm.statics import LOAD_CHANNELS, Environment, Load, MassSpec, SiteWrench, effort, joint_efforts, wrenches
 from armcal.base import se3
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
@@ -39,14 +27,10 @@ from armcal.errors import ConfigError, DataError, Location
 
 @dataclass(frozen=True)
 class ElasticSite:
-    """The coordinates of one site's deflection.
-
-    Attributes:
-        directions: rotations about these unit vectors of the site's frame; empty for a displacement on the joint's
-            own axis.
-    """
+    """The coordinates of one site's deflection."""
 
     site: int  # 0 for the mount, i for joint i (from 1)
+    # Rotations about these unit vectors of the site's frame; none for a displacement on the joint's own axis
     directions: tuple[Vector3, ...]
     springs: tuple[Spring, ...]  # what deflects there
 
@@ -56,10 +40,7 @@ class ElasticSite:
 
 
 def elastic_sites(chain: Chain, springs: Sequence[Spring]) -> tuple[ElasticSite, ...]:
-    """Sites in the order in which the springs name them first.
-
-    A sliding joint's own axis is a site of its own: what gives along it is no rotation.
-    """
+    """Sites in the order of their springs; a sliding joint's axis is one of its own: what gives along it is no turn."""
     grouped: dict[tuple[int, bool], list[Spring]] = defaultdict(list)
     for spring in springs:
         slides = spring.site > 0 and not spring.directions and not chain.joints[spring.site - 1].is_revolute
@@ -77,10 +58,7 @@ def deflections(
     sites: Sequence[ElasticSite],
     commands: Sequence[JointCommand],
 ) -> Expression:
-    """What each site's coordinates deflect under the wrenches (rad, or m on a sliding joint's axis), stacked.
-
-    ``commands`` are what each joint was commanded.
-    """
+    """What each site's coordinates deflect under the wrenches (rad, or m on a sliding joint's axis), stacked."""
     parts = []
     for site in sites:
         pose, wrench = frames.sites[site.site], acting[site.site]
@@ -102,11 +80,7 @@ def deflections(
 def split_deflection(
     joints: Sequence[Joint], sites: Sequence[ElasticSite], deflection: Expression
 ) -> tuple[list[Expression], dict[int, Expression]]:
-    """A stacked deflection as displacements on joints' own axes and rotations at sites.
-
-    Returns:
-        what to add to each joint's displacement, and the rotation matrices by site.
-    """
+    """A stacked deflection as what it adds to each joint's displacement, and rotation matrices by site."""
     along = [ca.SX(0) for _ in joints]
     rotations: dict[int, Expression] = {}
     start = 0
@@ -141,55 +115,40 @@ class MassiveModel(Protocol):
 
 @dataclass(frozen=True)
 class ArmInputs:
-    """What one record says of one arm.
+    """What one record says of one arm."""
 
-    Commands and approaches (n x 1), the load, the deflection to start from, what effects ask to know of the
-    surroundings, and corrections of tool and joints (6 + n x 1; see ``pose_residual``; None for nothing).
-    """
-
-    joint_angles: Expression
-    approach: Expression
+    joint_angles: Expression  # commands (n x 1)
+    approach: Expression  # n x 1
     load: Load
-    deflection: Expression
-    conditions: Mapping[str, Expression] = field(default_factory=dict)
-    correction: Expression | None = None
+    deflection: Expression  # to start from
+    conditions: Mapping[str, Expression] = field(default_factory=dict)  # what effects read of the surroundings
+    correction: Expression | None = None  # of tool and joints (6 + n x 1); see ``pose_residual``
 
 
 @dataclass(frozen=True)
 class ArmState:
-    """An arm in one record: its tool and named frames, and the deflection that its springs answer with.
-
-    In equilibrium ``next_deflection`` equals the deflection that was put in. ``efforts`` are what gravity and load do
-    about or along each joint's own axis (joints x 1; N m, N on sliding joints). ``origins`` are those of the mount
-    and of each joint's frame in the base frame (3x1 each; m).
-    """
+    """An arm in one record: its tool and named frames, and the deflection that its springs answer with."""
 
     base_T_tool: Transform
     frames: Mapping[str, Transform]
-    next_deflection: Expression
-    efforts: Expression = None
-    origins: tuple[Expression, ...] = ()
+    next_deflection: Expression  # in equilibrium, the deflection that was put in
+    efforts: Expression = None  # of gravity and load on each joint's own axis (joints x 1; N m, N on sliding joints)
+    origins: tuple[Expression, ...] = ()  # of the mount and of each joint's frame in the base frame (3x1 each; m)
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm of a problem.
-
-    Attributes:
-        placement: blocks of the pose of the model's base in the base frame (``placement_x`` and so on); none where
-            the two are the same.
-        residual: what corrects joints and tool where the rest leaves an error, once it is learned.
-        couplings: by joint, how many times the commands of others its own angle contains beside its own command.
-    """
+    """One arm of a problem."""
 
     name: str  # the instance name, first part of every parameter name
     model_name: str  # the model's name within it (``mdh``)
-    model: ArmModel  # the arm model
-    effects: Mapping[str, JointEffect]  # joint effects by their names
+    model: ArmModel
+    effects: Mapping[str, JointEffect]  # by their names
     masses: tuple[MassSpec, ...]  # what gravity pulls on
-    placement: tuple[ParameterBlock, ...] = ()
+    placement: tuple[ParameterBlock, ...] = ()  # the pose of the model's base in the base frame, where they differ
     joint_noise: float = 0.0  # standard deviation of what a turning joint reads against where it stands (rad)
-    residual: PoseResidual | None = None
+    residual: PoseResidual | None = None  # what corrects joints and tool, once it is learned
+    # By joint, how many times the commands of others its own angle contains beside its own command
     couplings: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
@@ -209,22 +168,16 @@ class Arm:
             joint: sum((factor * stated[other] for other, factor in self.couplings.get(joint, {}).items()), own)
             for joint, own in stated.items()
         }
-        return [
-            content[joint.name]
-            if joint.mimic is None
-            else joint.mimic.multiplier * content[joint.mimic.master] + joint.mimic.offset
-            for joint in self.nominal_chain.joints
-        ]
+        return self._followed(content, lambda mimic, master: mimic.multiplier * master + mimic.offset)
 
     def joint_approaches(self, approaches: Sequence[Any]) -> list[Any]:
         """From where every joint came (-1, 0, 1), from the ``commanded`` ones' approaches."""
         content = dict(zip(self.commanded, approaches, strict=True))
-        return [
-            content[joint.name]
-            if joint.mimic is None
-            else math.copysign(joint.mimic.multiplier != 0, joint.mimic.multiplier) * content[joint.mimic.master]
-            for joint in self.nominal_chain.joints
-        ]
+        return self._followed(content, lambda mimic, master: float(np.sign(mimic.multiplier)) * master)
+
+    def _followed(self, own: Mapping[str, Any], follow: Callable[[Mimic, Any], Any]) -> list[Any]:
+        joints = self.nominal_chain.joints
+        return [own[j.name] if j.mimic is None else follow(j.mimic, own[j.mimic.master]) for j in joints]
 
     @cached_property
     def command_channels(self) -> Mapping[str, str]:
@@ -421,11 +374,7 @@ def shown_joint(channel: str, arms: Collection[str]) -> str:
 
 
 def only_arm(arms: Mapping[str, Arm], purpose: str, hint: str, where: Location | None = None) -> Arm:
-    """The arm of a system that has one; ``purpose`` says why one is expected.
-
-    Raises:
-        ConfigError: there are several.
-    """
+    """The arm of a system that has one; ``purpose`` says why one is expected."""
     if len(arms) != 1:
         raise ConfigError(
             f"found {len(arms)} arms ({', '.join(arms)}), expected one: {purpose}.", where=where, hint=hint
@@ -435,16 +384,11 @@ def only_arm(arms: Mapping[str, Arm], purpose: str, hint: str, where: Location |
 
 @dataclass(frozen=True)
 class SiteLoads:
-    """Loads and levers of all sites (0 the mount, i joint i), on the rigid arm.
-
-    Attributes:
-        levers: how the tip moves in the base frame when a site turns about each of its own axes (sites x 3 x 3 x N;
-            base axis by site axis; m/rad).
-    """
+    """Loads and levers of all sites (0 the mount, i joint i), on the rigid arm."""
 
     moments: Array  # in the site's own axes, about its origin (sites x 3 x N; N m)
     efforts: Array  # about each joint's axis, or along it (joints x N; N m, N on sliding joints)
-    levers: Array
+    levers: Array  # of the tip in the base frame by turns about the site's axes (sites x 3 x 3 x N; m/rad)
 
 
 def site_loads(arm: Arm, values: Mapping[str, Array], commands: Array, acting: Array) -> SiteLoads:
@@ -471,9 +415,9 @@ def site_loads(arm: Arm, values: Mapping[str, Array], commands: Array, acting: A
 def holding_function(
     arm: Arm, gravity: Vector3, payload: float = 0.0, payload_com: Vector3 = (0.0, 0.0, 0.0)
 ) -> ca.Function:
-    """From commands (joints) to the static effort on each (N m or N), rigid and nominal, to be called often.
+    """From commands (joints) to the static effort on each (N m or N), rigid and nominal.
 
-    Gravity (m/s^2) in the base frame; the payload (kg) in the tool frame.
+    Gravity (m/s^2) is in the base frame, the payload (kg, m) in the tool frame.
     """
     chain, commands = arm.nominal_chain, ca.SX.sym("commands", len(arm.commanded))
     load = Environment(gravity, payload, payload_com).load

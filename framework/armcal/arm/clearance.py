@@ -127,7 +127,6 @@ class Clearance(Settings):
     forbidden: tuple[Annotated[Box | Ball, Field(discriminator="type")], ...] = ()
 
     def pairs(self, rule: Rule, moved_by: Mapping[str, int]) -> tuple[tuple[str, str], ...]:
-        """The pairs of parts that a rule is about; ``moved_by`` gives each frame's joint (0: none)."""
         kept = [name for name in self.parts if not any(fnmatchcase(name, other) for other in rule.besides)]
         joints = {name: [moved_by[frame] for shape in self.parts[name] for frame in shape.frames] for name in kept}
         firsts, seconds = (
@@ -140,18 +139,13 @@ class Clearance(Settings):
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found.
+    """How much farther apart parts are than asked."""
 
-    Attributes:
-        margins: how much farther apart than asked, the worst pair of each rule and then the forbidden regions
-            (rules + 1 x N, m; infinite where there is nothing to check).
-    """
-
+    # Of the worst pair of each rule, then of the forbidden regions (rules + 1 x N, m; infinite without any)
     margins: Array
 
     @property
     def allowed(self) -> Mask:
-        """Poses in which nothing is too near (N)."""
         return np.asarray(np.all(self.margins >= 0, axis=0))
 
 
@@ -160,20 +154,14 @@ def joints_of_frames(arm: Arm) -> dict[str, int]:
 
 
 class ClearanceCheck:
-    """A clearance, compiled for an arm."""
-
     def __init__(self, arm: Arm, clearance: Clearance) -> None:
         self._clearance = clearance
         moved_by = joints_of_frames(arm)
-        self._pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
+        self.pairs = [clearance.pairs(rule, moved_by) for rule in clearance.rules]
         capsules = [shape for shapes in clearance.parts.values() for shape in shapes if isinstance(shape, _ROUND)]
         points = {point for capsule in capsules for point in (capsule.start, capsule.end)}
         self._points = [_TOOL, *sorted(points, key=repr)]
         self._function = _point_function(arm, self._points)
-
-    @property
-    def pairs(self) -> tuple[tuple[tuple[str, str], ...], ...]:
-        return tuple(self._pairs)
 
     def worst(self, pose: Array) -> str:
         """What is too near in a pose (joints; rad or m), and by how much; empty where nothing is."""
@@ -181,23 +169,22 @@ class ClearanceCheck:
         row = int(np.argmin(margins))
         if margins[row] >= 0:
             return ""
-        regions = row == len(self._pairs)
+        regions = row == len(self.pairs)
         what = "the tool and a forbidden region" if regions else " and ".join(self._clearance.rules[row].between)
         return f"{what} are {-1000 * margins[row]:.0f} mm too near"
 
     def __call__(self, joint_angles: Array) -> Checked:
-        """Check commands (joints x N; rad or m)."""
         starts = range(0, joint_angles.shape[1], _AT_ONCE)
         parts = [self._margins(joint_angles[:, start : start + _AT_ONCE]) for start in starts]
-        return Checked(np.concatenate(parts, axis=1) if parts else np.zeros((len(self._pairs) + 1, 0)))
+        return Checked(np.concatenate(parts, axis=1) if parts else np.zeros((len(self.pairs) + 1, 0)))
 
     def _margins(self, joint_angles: Array) -> Array:
         count = joint_angles.shape[1]
         stacked = np.asarray(self._function.map(count)(joint_angles).full()).T.reshape(count, -1, 3)
         where = {point: stacked[:, i] for i, point in enumerate(self._points)}
-        margins = np.full((len(self._pairs) + 1, count), np.inf)
+        margins = np.full((len(self.pairs) + 1, count), np.inf)
         known: dict[tuple[str, str], Array] = {}
-        for row, (rule, pairs) in enumerate(zip(self._clearance.rules, self._pairs, strict=True)):
+        for row, (rule, pairs) in enumerate(zip(self._clearance.rules, self.pairs, strict=True)):
             for pair in pairs:
                 if pair not in known:
                     known[pair] = self._apart(pair, where, count)
@@ -222,14 +209,10 @@ class ClearanceCheck:
 
 
 def distance(first: Shape, second: Shape, where: Mapping[Point, Array]) -> Array:
-    """The distance of two shapes in every pose (N, m), given their points in the base frame (N x 3).
-
-    One of them must be a capsule.
-    """
+    """The distance of two shapes, one a capsule, in every pose (N, m), given their points in the base (N x 3)."""
     if not isinstance(first, _ROUND):
         first, second = second, first
-    if not isinstance(first, _ROUND):
-        raise ValueError("two fixed bodies need no check")
+    assert isinstance(first, _ROUND), "two fixed bodies need no check"
     start, end = (where[p] if p in where else np.array([p.at]) for p in (first.start, first.end))
     if isinstance(second, _ROUND):
         others = (where[p] if p in where else np.array([p.at]) for p in (second.start, second.end))
@@ -282,7 +265,6 @@ def _outside(points: Array, low: Array, high: Array) -> Array:
 
 
 def _point_function(arm: Arm, points: Sequence[Point]) -> ca.Function:
-    """Joint commands to the points in the base frame, stacked."""
     chain = arm.nominal_chain
     commands = ca.SX.sym("commands", len(arm.commanded))
     commanded = arm.joint_commands(ca.vertsplit(commands))

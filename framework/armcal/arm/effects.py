@@ -22,14 +22,11 @@ _UNIT = 1e-9
 
 @dataclass(frozen=True)
 class JointCommand:
-    """What is recorded of one joint: its commanded displacement (rad or m) and the direction it came from.
+    """What is recorded of one joint: its commanded displacement and the direction it came from."""
 
-    ``index`` counts from 0; ``approach`` is the sign of the joint's last motion, 0 where it is not known.
-    """
-
-    index: int
-    commanded: Expression
-    approach: Expression
+    index: int  # from 0
+    commanded: Expression  # rad or m
+    approach: Expression  # the sign of the joint's last motion, 0 where it is not known
 
     @property
     def joint(self) -> int:
@@ -44,16 +41,12 @@ MOUNT = JointCommand(-1, 0.0, 0.0)  # What the law of a spring at the mount is g
 class Spring:
     """An elastic deflection at a site.
 
-    Attributes:
-        site: 0 for the mount, i for joint i (from 1).
-        directions: unit vectors in the site's frame (after the joint's motion), one a coordinate; empty for the
-            joint's own axis.
-        law: from generalised loads (N m, or N on a prismatic joint's own axis; one a coordinate) and what its joint was
-            commanded (``MOUNT`` at the mount) to deflections (rad or m).
+    ``law`` leads from generalised loads (N m, or N on a prismatic joint's own axis; one a coordinate) and what its
+    joint was commanded (``MOUNT`` at the mount) to deflections (rad or m).
     """
 
-    site: int
-    directions: tuple[Vector3, ...]
+    site: int  # 0 for the mount, i for joint i (from 1)
+    directions: tuple[Vector3, ...]  # unit vectors in the site's frame, after its motion; none: the joint's own axis
     law: Callable[[Expression, JointCommand], Expression]
 
     @property
@@ -82,16 +75,10 @@ def check_springs(method: Callable[..., Any], given: Any, joints: int) -> tuple[
 
 @dataclass(frozen=True)
 class Condition:
-    """A recorded number of the surroundings that an effect reads.
+    """A recorded number of the surroundings that an effect reads."""
 
-    Attributes:
-        name: of its column, without the unit suffix (``humidity``).
-        dimension: of its unit, ``dimensionless`` for a pure number; may be left out for a column that any record may
-            carry (``temperature``).
-    """
-
-    name: str
-    dimension: str | None = None
+    name: str  # of its column, without the unit suffix (``humidity``)
+    dimension: str | None = None  # ``dimensionless`` for a pure number; None of what any record may carry
 
 
 JOINT_RATE = "joint rate"  # The dimension of rates of joints, sliding ones too
@@ -159,11 +146,7 @@ def reshapes(effect: JointEffect) -> bool:
 
 
 def chosen(joints: JointChoice, joint_names: Sequence[str]) -> tuple[int, ...]:
-    """The numbers (from 1) of the joints wanted, in the order of the chain.
-
-    Raises:
-        ValueError: a name is not one of the joints'.
-    """
+    """The numbers (from 1) of the chosen joints, in the order of the chain."""
     names = joint_names if joints == "all" else joints
     if fault := unknown_joint(names, joint_names):
         raise ValueError(fault)

@@ -4,8 +4,6 @@ An elastic pass F leads from a deflection d to the one that springs answer with;
 iterated, from wherever the caller has it already: passes while these lead to rest, Newton's method where they do not.
 Its derivatives follow from one pass, by the implicit function theorem [Griewank2008].
 
-Elastic equilibria d = F(d) that springs hold, found by Newton's method; others are distinguished from them.
-
 With the compliance C and the loads g, F = C g(d), and the Hessian of the potential energy is C^-1 (I - S), S = dF/dd:
 the springs hold the arm where every eigenvalue of I - S is positive, and where one is negative the load grows faster
 than its spring answers [Thompson1973]. Repeated passes lead to an equilibrium only where all eigenvalues of S are
@@ -24,7 +22,7 @@ from armcal.base import se3
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.se3 import Expression
 from armcal.errors import NotConvergedError
-from armcal.functions.interpreted import InterpretedFunction
+from armcal.functions.batch_function import InterpretedFunction
 
 REST_RAD = 1e-13  # A residual is taken when no deflection moves more than this in a pass: below 1e-6 mm on any arm
 NEAR_REST_RAD = 1e-10  # The linearisation corrects to second order, so it may start from here
@@ -38,11 +36,7 @@ Evaluate = Callable[[Indices], tuple[Array, Array]]  # F (n_d x k) and S (k x n_
 
 
 def by_passes(following: Callable[[], Array], state: Array, rest: float = REST_RAD) -> Mask:
-    """Replace states (n_d x N), in place, by what ``following`` gives of them until none moves more than ``rest``.
-
-    Returns:
-        which still move (N).
-    """
+    """Replace states (n_d x N) by what ``following`` gives until none moves more than ``rest``; which still do (N)."""
     for _ in range(MOST_PASSES):
         after = following()
         moved = np.abs(after - state)
@@ -144,10 +138,7 @@ class Evaluator:
     """
 
     def __init__(
-        self,
-        elastic: ElasticPass,
-        outputs: Expression,
-        many: Callable[[ca.Function], ManyRecords] | None = None,
+        self, elastic: ElasticPass, outputs: Expression, many: Callable[[ca.Function], ManyRecords] | None = None
     ) -> None:
         """``many`` makes functions of many records (compiled, where there are no shared values).
 
@@ -161,11 +152,7 @@ class Evaluator:
         self._outputs = outputs
 
     def __call__(self, values: Array, record: Array, state: Array) -> Array:
-        """Outputs (n_o x N) in equilibrium.
-
-        Raises:
-            NotConvergedError: a record has none that its springs hold; all states are where they were.
-        """
+        """Outputs (n_o x N) in equilibrium; where springs hold none, an error that leaves all states as they were."""
         before = state.copy()
         outputs, sound = self.settle(values, record, state)
         self._require(sound, values, record, state, before)
@@ -190,19 +177,11 @@ class Evaluator:
         return outputs, sound
 
     def recover(self, values: Array, record: Array, state: Array, before: Array) -> None:
-        """Bring records, to which passes from ``before`` led, to equilibria that the springs hold.
-
-        Raises:
-            NotConvergedError: a record has none; all states are left at ``before``.
-        """
+        """Bring records, to which passes from ``before`` led, to equilibria that the springs hold, as in a call."""
         self._require(self._hold(values, record, state, before), values, record, state, before)
 
     def require_held(self, values: Array, record: Array, state: Array) -> None:
-        """Refuse states in equilibrium that springs do not hold, such as a load balanced upright on a soft joint.
-
-        Raises:
-            NotConvergedError: of a record; all states are left at zero.
-        """
+        """Refuse states in equilibrium that springs do not hold, such as a load balanced upright on a soft joint."""
         if len(state):
             held = lowest(self._slopes(values, record, state)(np.arange(state.shape[1]))[1]) > 0
             self._require(held, values, record, state, np.zeros_like(state))

@@ -29,18 +29,7 @@ def by_dimension(
     keys: tuple[str, str] = ("plan.limits", "plan.travel_limits"),
     where: Location | None = None,
 ) -> dict[str, V]:
-    """What is stated of turning and of sliding joints, each under its own key, together.
-
-    Args:
-        joints: ``angle`` or ``length`` of each.
-        turning: of joints that turn.
-        sliding: of joints that slide.
-        keys: of the two in the configuration.
-        where: it was stated.
-
-    Raises:
-        ConfigError: a name is no joint's, or of one of the other kind.
-    """
+    """What is stated of turning and of sliding joints together; ``joints`` has ``angle`` or ``length`` of each."""
     for stated, dimension, key in ((turning, "angle", keys[0]), (sliding, "length", keys[1])):
         known = [joint for joint, own in joints.items() if own == dimension]
         if fault := unknown_joint(stated, known, _KINDS[dimension]):
@@ -55,9 +44,6 @@ def joint_limits(chain: Chain, *stated: Mapping[str, Limits]) -> dict[str, Limit
 
     Where joints are coupled, the model's are of their own angles: commands go as far as some of these let them, and
     ``within_couplings`` says which of them do.
-
-    Raises:
-        ValueError: limits are stated of a joint that is not there.
     """
     model = {joint.name: joint.limits for joint in chain.joints if joint.mimic is None}
     if any(joint.couplings for joint in chain.joints):
@@ -72,11 +58,7 @@ def joint_limits(chain: Chain, *stated: Mapping[str, Limits]) -> dict[str, Limit
 
 
 def require_couplings(joints: Mapping[str, str], couplings: Mapping[str, Mapping[str, float]]) -> None:
-    """Couplings of commanded joints (``angle`` or ``length``) must be of others, of their kind, and have an inverse.
-
-    Raises:
-        ValueError: what is wrong.
-    """
+    """Couplings of commanded joints (``angle`` or ``length``) must be of others, of their kind, and have an inverse."""
     for joint, others in couplings.items():
         if fault := unknown_joint([joint, *others], joints, "commanded "):
             raise ValueError(fault)
@@ -88,6 +70,5 @@ def require_couplings(joints: Mapping[str, str], couplings: Mapping[str, Mapping
 
 
 def coupling_matrix(chain: Chain) -> Array:
-    """From the commands of the commanded joints to their angles (n x n)."""
     joints = [joint for joint in chain.joints if joint.mimic is None]
     return np.array([[float(one is other) + one.couplings.get(other.name, 0.0) for other in joints] for one in joints])

@@ -31,33 +31,20 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint of a chain.
-
-    Attributes:
-        name: the joint's name.
-        parent_T_joint: from the moving frame of the joint before it (the chain's base for the first) to this
-            joint's frame at zero displacement.
-        angular: the axis of a revolute joint (unit, in its own frame); zeros for a prismatic one.
-        linear: the direction of a prismatic joint; zeros for a revolute one.
-        offset: displacement (rad or m) at zero angle.
-        limits: of its displacement less ``offset`` (rad or m); None where none are known.
-        endless: whether it may turn on and on, so that its angle may be of any size.
-        mimic: the joint that it follows; records have no column of one that does.
-        twist: what it moves along instead, of any pitch and length: angular and linear part (3x1 each) in its own
-            frame, not far from the axis, which still says whether it turns or slides; None for the axis itself.
-        couplings: how many times the commands of other joints its displacement contains beside its own command.
-    """
+    """One joint of a chain."""
 
     name: str
-    parent_T_joint: Transform
-    angular: Vector3 = Z_AXIS
-    linear: Vector3 = (0.0, 0.0, 0.0)
-    offset: Expression = 0.0
-    limits: tuple[float, float] | None = None
-    endless: bool = False
-    mimic: Mimic | None = None
+    parent_T_joint: Transform  # from the moving frame of the joint before it, or the mount, at zero displacement
+    angular: Vector3 = Z_AXIS  # the axis of a revolute joint (unit, in its own frame); zeros for a prismatic one
+    linear: Vector3 = (0.0, 0.0, 0.0)  # the direction of a prismatic joint; zeros for a revolute one
+    offset: Expression = 0.0  # displacement (rad or m) at zero angle
+    limits: tuple[float, float] | None = None  # of its displacement less ``offset`` (rad or m), where they are known
+    endless: bool = False  # whether it may turn on and on, so that its angle may be of any size
+    mimic: Mimic | None = None  # the joint that it follows; records have no column of one that does
+    # What it moves along in place of the axis, of any pitch and length: angular and linear part (3x1 each) in its own
+    # frame, not far from the axis, which still says whether it turns or slides
     twist: tuple[Expression, Expression] | None = None
-    couplings: Mapping[str, float] = field(default_factory=dict)
+    couplings: Mapping[str, float] = field(default_factory=dict)  # times the commands of other joints it contains
 
     @property
     def is_revolute(self) -> bool:
@@ -93,20 +80,12 @@ class Attachment:
 
 @dataclass(frozen=True)
 class Chain:
-    """A serial chain in the form that statics and effects work on.
+    """A serial chain in the form that statics and effects work on."""
 
-    Attributes:
-        base_T_mount: from the base frame, in which the arm is measured, to the mount, which carries joint 1. A
-            base spring deflects about its origin.
-        joints: from the base to the tip.
-        tool: the last frame, as an attachment.
-        frames: further named frames, for masses and measurements.
-    """
-
-    base_T_mount: Transform
-    joints: tuple[Joint, ...]
+    base_T_mount: Transform  # from the base frame to what carries joint 1; a base spring deflects about its origin
+    joints: tuple[Joint, ...]  # from the base to the tip
     tool: Attachment
-    frames: Mapping[str, Attachment] = field(default_factory=dict)
+    frames: Mapping[str, Attachment] = field(default_factory=dict)  # further ones, for masses and measurements
 
 
 def check_chain(method: Callable[..., Any], chain: Any, joint_names: Sequence[str]) -> None:
@@ -170,12 +149,9 @@ class Frames:
 
 
 def forward(chain: Chain, displacements: Sequence[Expression], rotations: Mapping[int, Expression]) -> Frames:
-    """Forward kinematics with deflections.
+    """Forward kinematics at displacements of each joint (rad or m), effects and offsets included.
 
-    Args:
-        chain: the arm.
-        displacements: of each joint (rad or m), effects and offsets included.
-        rotations: a further rotation (3x3) at a site (0 the mount), after the joint's motion.
+    ``rotations`` are further ones (3x3) at sites (0 the mount), after the joint's motion.
     """
     moving = [_deflected(chain.base_T_mount, rotations.get(0))]
     for index, (joint, displacement) in enumerate(zip(chain.joints, displacements, strict=True), start=1):

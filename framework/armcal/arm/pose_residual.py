@@ -37,14 +37,11 @@ def correction_names(joint_names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Postures:
-    """Where an arm was commanded to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each.
-
-    ``surroundings`` are those of ``SURROUNDINGS`` that are known (N each).
-    """
+    """Where an arm was commanded to go: commands (rad or m) and directions of approach (-1, 0, 1), joints x N each."""
 
     commands: Array
     approaches: Array
-    surroundings: Mapping[str, Array] = field(default_factory=dict)
+    surroundings: Mapping[str, Array] = field(default_factory=dict)  # those of ``SURROUNDINGS`` that are known (N each)
 
     def subset(self, chosen: Any) -> Postures:
         """Some of them."""
@@ -57,20 +54,13 @@ class ModelErrors:
     """What a model leaves, in units of the noise, and how corrections would change it.
 
     Nothing of it is what the model's parameters can do: the fit took that.
-
-    Attributes:
-        postures: of the records (N).
-        dimensions: ``angle`` or ``length`` of each joint.
-        residuals: in units of their noise and the record's weight (N x rows).
-        slopes: of them by the corrections (N x rows x corrections).
-        of_tool: how many of the tool's corrections a record determines: 0, 3 (shifts) or 6.
     """
 
-    postures: Postures
-    dimensions: tuple[str, ...]
-    residuals: Array
-    slopes: Array
-    of_tool: int
+    postures: Postures  # of the records (N)
+    dimensions: tuple[str, ...]  # ``angle`` or ``length`` of each joint
+    residuals: Array  # in units of their noise and the record's weight (N x rows)
+    slopes: Array  # of them by the corrections (N x rows x corrections)
+    of_tool: int  # how many of the tool's corrections a record determines: 0, 3 (shifts) or 6
 
 
 class PoseResidual(ABC):

@@ -29,11 +29,7 @@ _FINE = 2.0**60
 
 @dataclass(frozen=True)
 class PulseTable:
-    """Pulse lengths at known angles, linear between them and beyond the ends.
-
-    Raises:
-        ValueError: it is no such table.
-    """
+    """Pulse lengths at known angles, linear between them and beyond the ends."""
 
     angles: tuple[float, ...]  # rad, rising
     pulses: tuple[float, ...]  # s, above zero, rising or falling
@@ -50,11 +46,9 @@ class PulseTable:
             raise ValueError(f"a pulse of {min(self.pulses):g} s is not above zero")
 
     def pulse(self, angle: Expression) -> Expression:
-        """The pulse (s) that sets an angle (rad)."""
         return piecewise_linear(angle, self.angles, self.pulses)
 
     def angle(self, pulse: Expression) -> Expression:
-        """The angle (rad) that a pulse (s) sets."""
         order = slice(None) if self.pulses[0] < self.pulses[-1] else slice(None, None, -1)
         return piecewise_linear(pulse, self.pulses[order], self.angles[order])
 
@@ -67,13 +61,7 @@ class PulseTable:
 
 @dataclass(frozen=True)
 class PulseClock:
-    """A pulse generator: its measured oscillator (Hz) and its prescale.
-
-    Raises:
-        ValueError: no board has this prescale.
-    """
-
-    oscillator_hz: float
+    oscillator_hz: float  # measured
     prescale: int
 
     def __post_init__(self) -> None:
@@ -99,7 +87,7 @@ class PulseClock:
 
 
 def quantised(angle: Expression, table: PulseTable, clock: PulseClock) -> Expression:
-    """The angle (rad) at which a servo stands that was told another."""
+    """The angle (rad) at which a servo stands that was commanded another."""
     return table.angle(clock.counts(table.pulse(angle)) * clock.tick)
 
 

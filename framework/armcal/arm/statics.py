@@ -31,33 +31,25 @@ LOAD_CHANNELS = (
 
 @dataclass(frozen=True)
 class MassSpec:
-    """A mass in a named frame of the chain, ``mount`` or ``tool``: numbers as stated, or expressions of parameters.
+    """A mass in a named frame of the chain, ``mount`` or ``tool``: numbers as stated, or expressions of parameters."""
 
-    Attributes:
-        loads_up_to: the last joint it loads (from 1); None for the physical one, the joint that moves it.
-    """
-
-    name: str  # what it is
+    name: str
     mass: Expression  # kg
     com: Expression  # centre of mass in its frame (3, or 3x1; m)
-    frame: str  # that frame
-    loads_up_to: int | None = None
+    frame: str
+    loads_up_to: int | None = None  # the last joint it loads (from 1); unless given the one that moves it
 
 
 @dataclass(frozen=True)
 class Load:
-    """What acts on the arm in one record.
-
-    Attributes:
-        beyond: mass (kg) and first moment in the tool frame (3x1, kg m) of what hangs there beside the payload.
-    """
+    """What acts on the arm in one record."""
 
     gravity: Expression  # acceleration in the base frame (3x1, m/s^2)
     payload_mass: Expression  # kg, on top of the arm's own masses
     payload_com: Expression  # its centre in the tool frame (3x1, m)
     force: Expression  # external force at the tool frame's origin, in the base frame's axes (3x1, N)
     torque: Expression  # external torque, in the base frame's axes (3x1, N m)
-    beyond: tuple[Expression, Expression] | None = None
+    beyond: tuple[Expression, Expression] | None = None  # mass (kg), first moment (kg m) in the tool beside the payload
 
     @classmethod
     def of(cls, acting: Sequence[Expression]) -> Self:
@@ -80,11 +72,7 @@ def wrenches(chain: Chain, frames: Frames, masses: Sequence[MassSpec], load: Loa
     weight_at: dict[int, Expression] = defaultdict(lambda: ca.SX(0))
     moment_at: dict[int, Expression] = defaultdict(lambda: ca.SX(3, 1))
     mount, moved_by = frames.sites[0], frame_names(chain)
-    places = {
-        **frames.named,
-        MOUNT_FRAME: se3.Transform(mount.rotation, mount.origin),
-        TOOL_FRAME: frames.base_T_tool,
-    }
+    places = {**frames.named, MOUNT_FRAME: se3.Transform(mount.rotation, mount.origin), TOOL_FRAME: frames.base_T_tool}
     for mass in masses:
         up_to = moved_by[mass.frame] if mass.loads_up_to is None else mass.loads_up_to
         weight_at[up_to] += mass.mass

@@ -4,6 +4,7 @@ Arrays are stored channel by channel, (entries x records).
 """
 
 import ctypes
+import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import accumulate
@@ -14,30 +15,80 @@ import numpy as np
 
 from armcal.base.arrays import Array
 from armcal.functions import c_source, compiler
-from armcal.functions.interpreted import InterpretedFunction
 
 EvaluatorChoice = Literal["auto", "compiled", "interpreted"]
 
 _ENTRY, _VECTOR, _ITERATE = "armcal_evaluate", "armcal_evaluate_vector", "armcal_iterate"
 _AGREEMENT = 1e-9
+_BLOCKS = (64, 8, 1)  # Records that are interpreted together; what does not fill a block goes to smaller ones
 _WORTH_COMPILING = 100_000  # Records that the interpreter takes longer for than the compiler takes to make a library
 
 
-class BatchFunction:
-    """A function of column vectors, to be called for many records.
+class BoundFunction:
+    """A CasADi function with memory of its own; not to be shared between threads.
 
-    Attributes:
-        function: the CasADi function (SX, dense inputs and outputs).
-        interpreted: the same by CasADi's interpreter.
-        compiled: whether C serves it.
+    ``evaluate`` reads ``inputs`` and writes ``outputs`` (records x entries each; the first ``shared`` inputs: entries).
     """
 
+    def __init__(self, function: ca.Function, records: int = 1, shared: int = 0) -> None:
+        ins = [function.numel_in(i) for i in range(function.n_in())]
+        outs = [function.numel_out(i) for i in range(function.n_out())]
+        if records > 1:
+            function = function.map(f"{function.name()}_block", "serial", records, list(range(shared)), [])
+        self.inputs = [np.zeros(size if i < shared else (records, size)) for i, size in enumerate(ins)]
+        self.outputs = [np.zeros((records, size)) for size in outs]
+        self._buffer: Any  # keeps the memory that ``evaluate`` works on
+        self.evaluate: Callable[[], None]
+        self._buffer, self.evaluate = function.buffer()
+        for arrays, bind in ((self.inputs, self._buffer.set_arg), (self.outputs, self._buffer.set_res)):
+            for place, array in enumerate(arrays):
+                if array.size:
+                    bind(place, array.data)
+
+
+class InterpretedFunction:
+    """A CasADi function of column vectors (dense inputs and outputs) over many records.
+
+    Its first ``shared`` inputs are the same for all of them.
+    """
+
+    def __init__(self, function: ca.Function, shared: int = 0) -> None:
+        self.function, self._shared = function, shared
+        self._memory = threading.local()
+        self._sizes_out = [function.numel_out(i) for i in range(function.n_out())]
+
+    def __call__(self, *inputs: Array) -> list[Array]:
+        """The outputs (entries x N each) for inputs (entries x N each; shared ones: entries)."""
+        start, count = 0, inputs[self._shared].shape[1]
+        if count in _BLOCKS:
+            return [array.T.copy() for array in self._evaluated(inputs, count)]
+        outputs = [np.empty((size, count)) for size in self._sizes_out]
+        for block in _BLOCKS:
+            while count - start >= block:
+                part = slice(start, start + block)
+                columns = (source[:, part] for source in inputs[self._shared :])
+                arrays = self._evaluated((*inputs[: self._shared], *columns), block)
+                for target, array in zip(outputs, arrays, strict=True):
+                    target[:, part] = array.T
+                start += block
+        return outputs
+
+    def _evaluated(self, inputs: Sequence[Array], records: int) -> list[Array]:
+        own: Any = self._memory.__dict__  # each thread's, by the number of records at once
+        bound: BoundFunction | None = own.get(records)
+        if bound is None:
+            bound = own[records] = BoundFunction(self.function, records, self._shared)
+        for array, source in zip(bound.inputs, inputs, strict=True):
+            array[...] = source.T
+        bound.evaluate()
+        return bound.outputs
+
+
+class BatchFunction:
+    """A function of column vectors (SX, dense inputs and outputs), to be called for many records."""
+
     def __init__(
-        self,
-        function: ca.Function,
-        sample: Sequence[Array],
-        choice: EvaluatorChoice = "auto",
-        iterated: bool = False,
+        self, function: ca.Function, sample: Sequence[Array], choice: EvaluatorChoice = "auto", iterated: bool = False
     ) -> None:
         """Build it; ``sample`` are inputs (entries x 8 each) on which C must agree with the interpreter.
 
@@ -214,8 +265,16 @@ def _agreeing(batch: BatchFunction, library: ctypes.CDLL | None, sample: Sequenc
     given = [np.ascontiguousarray(array[:, : c_source.LANES]) for array in sample]
     mine = [np.empty((size, c_source.LANES)) for size, _ in batch.places]
     _evaluate(library.armcal_evaluate, given, mine, c_source.LANES)
-    agreeing = all(compiler.agree(*both, _AGREEMENT) for both in zip(batch(*given), mine, strict=True))
+    agreeing = all(agree_within(*both, _AGREEMENT) for both in zip(batch(*given), mine, strict=True))
     return library if agreeing else None
+
+
+def agree_within(expected: Array, given: Array, tolerance: float) -> bool:
+    """Whether numbers differ by no more than a share of the largest, or of 1; exactly where one is not finite."""
+    scale = max(1.0, float(np.nanmax(np.abs(expected), initial=0.0)))
+    if not np.isfinite(scale):
+        return np.array_equal(expected, given, equal_nan=True)
+    return np.allclose(expected, given, rtol=0.0, atol=tolerance * scale, equal_nan=True)
 
 
 def _evaluate(function: Any, inputs: Sequence[Array], outputs: Sequence[Array], count: int) -> None:

@@ -4,6 +4,8 @@ A library's key covers the expression, the generator, the compiler, its flags an
 stale or foreign one is never loaded. Its name ends in a digest of its content, so that a torn one is not loaded
 either. Who uses one compares its numbers with the interpreter's. ``ARMCAL_CACHE_DIR`` moves the cache;
 ``ARMCAL_CC=none`` turns compiling off, any other value names the compiler.
+
+Run as a script, this file builds a library from a folder with ``kernel.c`` and ``job.json``: it needs Python alone.
 """
 
 import ctypes
@@ -23,17 +25,16 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
-from armcal.base.arrays import Array
-from armcal.functions import library_build
-from armcal.functions.c_source import UnsupportedExpressionError
-
 FLAGS = ("-O1", "-march=native", "-ffp-contract=off", "-fPIC", "-shared", "-w")
 ENTRY_POINTS = ("armcal_residuals", "armcal_linearise")
 KEPT_LIBRARIES = 64
 _COMPILE_LIMIT_S = 120
 _BUILD = ".build-"
+_DIGEST = 32
+
+
+class UnsupportedExpressionError(Exception):
+    """An expression has an operation that has no C form here; the interpreter serves."""
 
 
 @cache
@@ -42,11 +43,8 @@ def find_compiler() -> str | None:
     named = os.environ.get("ARMCAL_CC", "")
     if named == "none":
         return None
-    for name in [named] if named else [os.environ.get("CC", ""), "cc", "gcc", "clang"]:
-        text = shutil.which(name) if name else None
-        if text:
-            return text
-    return None
+    names = [named] if named else [os.environ.get("CC", ""), "cc", "gcc", "clang"]
+    return next((path for name in names if name and (path := shutil.which(name))), None)
 
 
 def cache_directory() -> Path:
@@ -57,16 +55,8 @@ def cache_directory() -> Path:
 
 
 def library_key(text: str) -> str:
-    parts = (text, " ".join(FLAGS), _compiler_identity(), processor())
+    parts = (text, " ".join(FLAGS), _compiler_identity(), _processor())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
-
-
-def agree(expected: Array, given: Array, tolerance: float) -> bool:
-    """Whether numbers differ by no more than a share of the largest, or of 1; exactly where one is not finite."""
-    scale = max(1.0, float(np.nanmax(np.abs(expected), initial=0.0)))
-    if not np.isfinite(scale):
-        return np.array_equal(expected, given, equal_nan=True)
-    return np.allclose(expected, given, rtol=0.0, atol=tolerance * scale, equal_nan=True)
 
 
 def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
@@ -76,10 +66,10 @@ def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.
     """
     directory = cache_directory()
     with suppress(OSError):
-        for path in sorted(directory.glob(library_build.library_name(key, "*"))):
+        for path in sorted(directory.glob(f"{key}-*.so")):
             if not (_is_ours(path) and _is_ours(directory)):
                 continue
-            if path.name != library_build.library_name(key, library_build.digest_of(path.read_bytes())):
+            if path.name != _library_name(key, path.read_bytes()):
                 path.unlink()
                 continue
             os.utime(path)
@@ -89,11 +79,13 @@ def load_cached(key: str, entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.
     return None
 
 
+def _library_name(key: str, content: bytes) -> str:
+    return f"{key}-{hashlib.sha256(content).hexdigest()[:_DIGEST]}.so"
+
+
 def _is_ours(path: Path) -> bool:
     seen = path.stat()
-    return not hasattr(os, "getuid") or (
-        seen.st_uid == os.getuid() and not seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    )
+    return seen.st_uid == os.getuid() and not seen.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def compile_now(key: str, source: Callable[[], str], entry_points: Sequence[str] = ENTRY_POINTS) -> ctypes.CDLL | None:
@@ -133,10 +125,10 @@ def _prepare(key: str, source: Callable[[], str]) -> list[str] | None:
         build = Path(tempfile.mkdtemp(prefix=_BUILD, dir=directory))
         (build / "kernel.c").write_text(text, encoding="utf-8")
         (build / "job.json").write_text(json.dumps(job), encoding="utf-8")
-    except (OSError, UnsupportedExpressionError):  # an expression without a C form is no fault: the interpreter serves
+    except (OSError, UnsupportedExpressionError):
         return None
     # -I and -S: nothing but Python's own library is found, whatever lies in the working directory.
-    return [sys.executable, "-I", "-S", library_build.__file__, str(build)]
+    return [sys.executable, "-I", "-S", __file__, str(build)]
 
 
 def _forget_old(directory: Path) -> None:
@@ -152,10 +144,7 @@ def _forget_old(directory: Path) -> None:
 
 @cache
 def _compiler_identity() -> str:
-    compiler = find_compiler()
-    if compiler is None:
-        return ""
-    real = Path(compiler).resolve()
+    real = Path(find_compiler() or "").resolve()
     with suppress(OSError):
         seen = real.stat()
         return f"{real} {seen.st_size} {seen.st_mtime_ns}"
@@ -163,9 +152,39 @@ def _compiler_identity() -> str:
 
 
 @cache
-def processor() -> str:
+def _processor() -> str:
     """What ``-march=native`` depends on."""
     with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join(sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))}))
     return f"{platform.machine()} {platform.processor()} {platform.node()}"
+
+
+def _build(folder: Path) -> None:
+    """Compile, make durable, and only then put in place under a name that ends in the digest."""
+    os.umask(0o077)
+    job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    made, place = folder / "kernel.so", Path(job["place"])
+    command = [*job["compile"], "-o", str(made), str(folder / "kernel.c"), "-lm"]
+    subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=True, timeout=_COMPILE_LIMIT_S)
+    name = _library_name(job["key"], made.read_bytes())
+    _sync(made)
+    made.replace(place / name)
+    _sync(place)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+if __name__ == "__main__":
+    try:
+        _build(Path(sys.argv[1]))
+    except (OSError, subprocess.SubprocessError):
+        sys.exit(1)
+    finally:
+        shutil.rmtree(sys.argv[1], ignore_errors=True)

@@ -22,9 +22,8 @@ from typing_extensions import override
 from armcal.arm.evaluator import MOST_DEFLECTION, MOST_PASSES, NEAR_REST_RAD, REST_RAD, Evaluator, by_passes
 from armcal.base.arrays import Array, Indices
 from armcal.functions import c_source, compiler
-from armcal.functions.batch_function import EvaluatorChoice
+from armcal.functions.batch_function import EvaluatorChoice, InterpretedFunction, agree_within
 from armcal.functions.c_source import LANES
-from armcal.functions.interpreted import InterpretedFunction
 from armcal.problem.factor import Factor
 from armcal.problem.records import FactorRecords, PointRecords, declared, mean_shares, transformed
 
@@ -112,7 +111,7 @@ class Compiled(Backend):
 def agree(factor: Factor, interpreter: Backend, compiled: Backend) -> bool:
     """Whether a library gives the interpreter's numbers; one that was compiled wrong is not used."""
     results = zip(_sample(factor, interpreter)[2:], _sample(factor, compiled)[2:], strict=True)
-    return all(compiler.agree(*both, _AGREEMENT) for both in results)
+    return all(agree_within(*both, _AGREEMENT) for both in results)
 
 
 def _sample(factor: Factor, backend: Backend) -> tuple[Array, Array, Array, Array]:

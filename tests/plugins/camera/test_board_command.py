@@ -16,8 +16,7 @@ import cv2
 from armcal.errors import InputError
 from armcal_camera.board import Board, read_board
 from armcal_camera.board_command import board as command
-from armcal_camera.detection import detect
-from armcal_camera.images import Grey
+from armcal_camera.detection import Grey, detect
 
 KINDS = {
     "chessboard": ("--columns", "9", "--rows", "6", "--square-mm", "25"),

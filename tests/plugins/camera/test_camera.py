@@ -91,7 +91,7 @@ def test_undistorted_places_project_back(lens: str, distortion: tuple[float, ...
     symbol = ca.SX.sym("p", 3)
     own = ca.Function("p", [symbol], [projected(lens, symbol, focal, centre, distortion)])
     image = np.array(own(np.vstack([rays, np.ones(30)])))
-    assert np.allclose(normalised(lens, image, focal, centre, np.array(distortion)), rays, atol=1e-7)
+    assert np.allclose(normalised(lens, image.T, focal, centre, np.array(distortion)).T, rays, atol=1e-7)
     assert pinhole(0.0, 0.0, DISTORTED[0]) == (0.0, 0.0)
 
 

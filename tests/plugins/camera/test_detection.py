@@ -14,9 +14,8 @@ from armcal.errors import DataError, PluginError
 
 pytest.importorskip("cv2")
 import cv2
-from armcal_camera.board import Aprilgrid, Board, Charuco, Chessboard, dark_rectangles, outline
-from armcal_camera.detection import detect
-from armcal_camera.images import Grey, grey_image, opencv
+from armcal_camera.board import Aprilgrid, Board, Charuco, Chessboard, dark_rectangles, opencv, outline
+from armcal_camera.detection import Grey, detect, grey_image
 from armcal_camera.render import Exposure, Lens, render
 
 from tests.plugins.camera.sheets import APRILGRID, CHARUCO, CHESSBOARD, SIZE, TAG, facing, projected
@@ -193,7 +192,7 @@ def test_an_image_with_too_many_pixels_is_refused_by_its_header(kind: str, monke
     image = np.full((100, 130) + ((3,) if kind == ".ppm" else ()), 90, np.uint8)
     content = cv2.imencode(kind, image)[1].tobytes()
     assert grey_image(content, "image").shape == (100, 130)
-    monkeypatch.setattr("armcal_camera.images.MOST_PIXELS", 12_999)
+    monkeypatch.setattr("armcal_camera.detection.MOST_PIXELS", 12_999)
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(
         DataError, match=r"image: found an image of more than 0\.012999 million pixels, expected at most"

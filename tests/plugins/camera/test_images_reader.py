@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +19,7 @@ from armcal.measure.reader import ReadRequest, RequestedChannel
 pytest.importorskip("cv2")
 import cv2
 from armcal_camera.board import Board, Chessboard
+from armcal_camera.camera import Camera, CameraSettings
 from armcal_camera.images_reader import ImagesReader, ImagesSettings
 from armcal_camera.intrinsics import IntrinsicsSettings
 from armcal_camera.pose_table import FLANGE
@@ -35,9 +36,8 @@ COUNT = 5
 TURNS = [(0.1 * i, 0.2 - 0.1 * i, 0.05 * i) for i in range(COUNT)]
 
 
-@dataclass
-class Camera:
-    boards: tuple[Board, ...] = (BOARD,)
+def camera_of(board: Board = BOARD, **settings: object) -> Camera:
+    return Camera(CameraSettings.si(noise=1e-4, board=board, **settings), ("arm",))
 
 
 @cache
@@ -65,7 +65,7 @@ def truth(i: int) -> Any:
 
 
 def request_of(joints: tuple[str, ...] = ("q1", "q2"), camera: Camera | None = None) -> ReadRequest:
-    camera = camera or Camera()
+    camera = camera or camera_of()
     dimensions = {name: "length" if name in ("x", "y", "z") else "angle" for name in joints}
     channels = [RequestedChannel(f"arm.{name}", (name,), dimensions[name], True) for name in joints]
     channels += [
@@ -88,10 +88,9 @@ def read(request: ReadRequest | None = None, **settings: object) -> Any:
 
 
 def test_intrinsics_of_half_the_images_size_are_refused_with_the_factor(folder: Path) -> None:
-    camera = Camera()
     width, height = SIZE
     half = {"fx": 0.4, "fy": 0.4, "cx": 0.3, "cy": 0.2, "image": (width / 2000, height / 2000)}
-    camera.settings = SimpleNamespace(intrinsics=IntrinsicsSettings.si(**half))
+    camera = camera_of(intrinsics=IntrinsicsSettings.si(**half))
     with pytest.raises(DataError, match=f"these are {width} x {height}: scale fx, fy, cx and cy by 2, or give"):
         read(request_of(camera=camera), folder=folder, poses=folder / "poses.csv")
 
@@ -115,7 +114,7 @@ def test_how_much_is_looked_at_is_reported(folder: Path) -> None:
     assert len(seen) > COUNT and seen == sorted(seen) and (seen[0], seen[-1]) == (0.0, 1.0)
     seen.clear()
     joints = tuple(channel for channel in asked.channels if not channel.parts)
-    two = replace(asked, measurements={"left": Camera(), "right": Camera()}, channels=joints)
+    two = replace(asked, measurements={"left": camera_of(), "right": camera_of()}, channels=joints)
     read(two, folder={"left": str(folder), "right": str(folder)}, poses=folder / "poses.csv")
     assert seen == sorted(seen) and 0.5 in seen and seen[-1] == 1.0
 

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from armcal.cli.main import cli
 from armcal.testing import assert_contract
-from armcal_camera.live import Camera
+from armcal_camera.images_reader import LiveImages
 from click.testing import CliRunner
 from recordings import QUICK, ROOT, GuidedArm, Recording, recorded
 
@@ -190,4 +190,4 @@ def test_no_board_in_twenty_images(tmp_path: Path, shots: Shots, arm: GuidedArm)
 
 
 def test_keeps_the_contract() -> None:
-    assert_contract(Camera, "camera")
+    assert_contract(LiveImages, "camera")

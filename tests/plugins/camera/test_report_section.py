@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from armcal_camera.report import cameras
+from armcal_camera.export import cameras
 
 
 def test_a_run_without_a_camera_imports_none(monkeypatch: pytest.MonkeyPatch) -> None:

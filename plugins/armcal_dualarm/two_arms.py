@@ -1,4 +1,9 @@
-"""Logs of several arms' motors: columns in a robot's own order, in motor radians. [Bergstrom2016]"""
+"""Two arms: clamped together at their tools, a closed chain; and logs of the motors of several arms. [Bergstrom2016]
+
+A clamp is found along with the arms. The pose of the right tool in the left one is the clamp's, whatever the joints do.
+What the joints give instead is the closing error, and it belongs to both arms at once: it is not split between them.
+A log has its columns in a robot's own order, in motor radians.
+"""
 
 import difflib
 import math
@@ -6,36 +11,113 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NoReturn, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+import casadi as ca
 import numpy as np
+from armcal.arm.assembly import ArmState
+from armcal.base import se3
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
-from armcal.base.settings import InputPath, Settings
+from armcal.base.parameters import ParameterBlock
+from armcal.base.poses import PoseSettings, pose_blocks, pose_transform, quaternion_expression
+from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.base.units import from_unit
-from armcal.errors import DataError, Location
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
+from armcal.measure.instrument import Contact
 from armcal.measure.reader import ReadRequest
 from armcal.measure.rests import StillSettings, rests
 from armcal.measure.tables import Columns, is_missing, is_number, open_table
 from pydantic import Field, model_validator
 
+
+class ClosedChainSettings(Settings):
+    """Which two arms hold each other, how well the clamp holds (standard deviations), and what is known of it.
+
+    ``clamps`` are the poses of the right tool in the left one that are known, by the clamp's name: a record's text
+    columns ``group_labels`` joined by a slash, or ``one`` if there are none. A clamp that is not named here is found;
+    one that is named is held, unless ``parameters.free`` frees it, best under a prior.
+    """
+
+    left: str = "left"
+    right: str = "right"
+    noise: Annotated[Length, Field(gt=0)]
+    orientation_noise: Annotated[Angle, Field(gt=0)]
+    group_labels: tuple[str, ...] = ()
+    clamps: dict[str, PoseSettings] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _sane(self) -> Self:
+        if self.left == self.right:
+            raise ValueError(f"found {self.left} on both sides, expected two arms")
+        return self
+
+
+class ClosedChain(Contact):
+    """The measurement ``closed_chain``: of each clamp the blocks clamp_x, clamp_y, clamp_z and clamp_rotation."""
+
+    Settings: ClassVar[type[ClosedChainSettings]] = ClosedChainSettings
+    EXAMPLE: ClassVar[Mapping[str, Any]] = {
+        "noise_mm": 0.1,
+        "orientation_noise_mrad": 0.5,
+        "clamps": {"one": {"position_mm": [0, 0, 40], "rpy_deg": [180, 0, 90]}},
+    }
+
+    def __init__(self, settings: ClosedChainSettings, arm_names: Sequence[str]) -> None:
+        self._settings = settings
+        for name in (settings.left, settings.right):
+            if name not in arm_names:
+                raise ValueError(f"no arm is called {name!r}; the arms are {', '.join(arm_names)}")
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        return (self._settings.left, self._settings.right)
+
+    @property
+    def group_labels(self) -> tuple[str, ...]:
+        return self._settings.group_labels
+
+    def group_parameters(self, group: str) -> tuple[ParameterBlock, ...]:
+        known = self._settings.clamps.get(group)
+        blocks = pose_blocks("clamp") if known is None else known.blocks("clamp")
+        return tuple(replace(block, free=known is None) for block in blocks)
+
+    def named_groups(self) -> tuple[str, ...]:
+        return tuple(self._settings.clamps)
+
+    def group_starts(self, arms: Mapping[str, ArmState], values: Mapping[str, Any]) -> dict[str, Any]:
+        between = self._between(arms)
+        place = {f"clamp_{axis}": between.translation[i] for i, axis in enumerate("xyz")}
+        return {**place, "clamp_rotation": quaternion_expression(between.rotation)}
+
+    def residual(self, arms: Mapping[str, ArmState], measured: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+        """The closing error in the clamp's right frame: position (3, m) and rotation vector (3, rad)."""
+        error = pose_transform("clamp", values).inverse() @ self._between(arms)
+        return ca.vertcat(error.translation, se3.rotation_vector(error.rotation))
+
+    def noise(self) -> tuple[float, ...]:
+        return (self._settings.noise,) * 3 + (self._settings.orientation_noise,) * 3
+
+    def dimensions(self) -> tuple[str, ...]:
+        return ("length",) * 3 + ("angle",) * 3
+
+    def _between(self, arms: Mapping[str, ArmState]) -> se3.Transform:
+        left, right = (arms[name].base_T_tool for name in self.arms)
+        return left.inverse() @ right
+
+
 Column = str | int  # A column's name in the header, or its number from 1
 
 
-def read_columns(
+def _read_columns(
     path: Path, delimiter: str, numbers: Sequence[Column], texts: Sequence[Column]
 ) -> tuple[Columns, list[str], str]:
-    """Columns of a log, what those of numbers are called in it, and the file's sha256.
-
-    Raises:
-        DataError: with file, line and column.
-    """
+    """Columns of a log, what those of numbers are called in it, and the file's sha256."""
     with open_table(path, "a log", delimiter, empty="Give a row a moment.") as table:
         line, cells = table.first[0], [cell.strip() for cell in table.first[1]]
-        header = cells if is_header(cells, numbers, texts) else []
-        places = [place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
+        header = cells if _is_header(cells, numbers, texts) else []
+        places = [_place_of(path, line, header, len(cells), column) for column in (*numbers, *texts)]
         names = [header[place] if header else f"column {place + 1}" for place in places[: len(numbers)]]
         named = list(zip(places, names, strict=False))
         read = table.columns(named, places[len(numbers) :], has_header=bool(header))
@@ -45,7 +127,7 @@ def read_columns(
     return replace(read, texts=words), names, table.sha256
 
 
-def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
+def _is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[Column]) -> bool:
     """Whether the first row holds names: for columns by name, no number at all; by place, none where one is due."""
     if any(isinstance(column, str) for column in (*numbers, *texts)):
         return not any(is_number(cell) for cell in cells)
@@ -53,12 +135,8 @@ def is_header(cells: Sequence[str], numbers: Sequence[Column], texts: Sequence[C
     return not any(is_number(cell) for cell in due) and any(not is_missing(cell) for cell in due)
 
 
-def place_of(path: Path, line: int | None, header: Sequence[str], count: int, column: Column) -> int:
-    """Where a column stands, from 0.
-
-    Raises:
-        DataError: it is not there, or several times.
-    """
+def _place_of(path: Path, line: int | None, header: Sequence[str], count: int, column: Column) -> int:
+    """Where a column stands, from 0."""
     if isinstance(column, int):
         if not 1 <= column <= count:
             refuse(path, f"found {count} columns, expected a column {column}.", "Columns count from 1.", line)
@@ -99,10 +177,6 @@ class ArmColumns(Settings):
     @property
     def from_base(self) -> tuple[Column, ...]:
         return tuple(self.columns[number - 1] for number in self.order or range(1, len(self.columns) + 1))
-
-    @property
-    def ratios(self) -> Array:
-        return np.ones(len(self.columns)) if self.gear_ratios is None else np.array(self.gear_ratios)
 
 
 class TwoArmLogSettings(Settings):
@@ -153,24 +227,20 @@ class TwoArmLogReader:
         self._settings = settings
 
     def read(self, request: ReadRequest) -> Dataset:
-        """The log in SI; ``rows`` are lines, those of a rest's first row.
-
-        Raises:
-            DataError: with file, line and column.
-        """
+        """The log in SI; ``rows`` are lines, those of a rest's first row."""
         s, path = self._settings, self._settings.path
         for name, arm in s.arms.items():
             if name not in request.arms:
-                self._refuse(f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
+                refuse(path, f"no arm is called {name!r}; the arms are {', '.join(request.arms)}.", "Correct the name.")
             if len(arm.columns) != (joints := len(request.arms[name].commanded)):
                 text = f"found {len(arm.columns)} columns for the arm {name}, which has {joints} joints."
-                self._refuse(text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
+                refuse(path, text, f"Give arms: {{{name}: {{columns: [...]}}}} a column for each joint.")
         channels = [f"{name}.{joint}" for name in s.arms for joint in request.arms[name].commanded]
         times = [] if s.time is None else [s.time]
         numbers = [*(column for arm in s.arms.values() for column in arm.from_base), *times]
-        read, column_names, digest = read_columns(path, s.delimiter, numbers, list(s.labels.values()))
-        ratios = np.concatenate([arm.ratios for arm in s.arms.values()])
-        joint_angles = np.array(read.numbers[: len(channels)]) / ratios[:, None]
+        read, column_names, digest = _read_columns(path, s.delimiter, numbers, list(s.labels.values()))
+        ratios = [ratio for arm in s.arms.values() for ratio in arm.gear_ratios or (1.0,) * len(arm.columns)]
+        joint_angles = np.array(read.numbers[: len(channels)]) / np.array(ratios)[:, None]
         values = dict(zip(channels, joint_angles, strict=True))
         names = dict(zip(channels, column_names, strict=False))
         turning = {w.channel for w in request.channels if w.dimension == "angle" and not w.is_endless}
@@ -180,7 +250,7 @@ class TwoArmLogReader:
                 first = int(over[0])
                 text = f"{channel} would stand at {row[first]:.6g} rad there, more than one turn (2 pi rad)."
                 hint = "Check order and gear_ratios, both from the base, and that the log is in radians."
-                self._refuse(text, hint, read.lines[first], names[channel])
+                refuse(path, text, hint, read.lines[first], names[channel])
         if times:
             values["time"] = from_unit(read.numbers[-1], s.time_unit)
         return read_as(self._dataset(read, digest, joint_angles, values), request, names)
@@ -194,7 +264,7 @@ class TwoArmLogReader:
             still = rests(joints, read.texts, values.get("time"), s.still)
             if not still:
                 text = f"found no moment at which no joint moves by more than {np.degrees(s.still.spread):.3g} deg."
-                self._refuse(text, "Give a wider spread_deg or a shorter window under still.")
+                refuse(s.path, text, "Give a wider spread_deg or a shorter window under still.")
             used = sum(rest.stop - rest.start for rest in still)
             rows = f"{used} of {len(read.lines)} rows"
             warnings = (f"{s.path}: the log was reduced to {len(still)} still moments, the means of {rows}.",)
@@ -206,6 +276,3 @@ class TwoArmLogReader:
         texts = {name: tuple(cells[i] for i in starts) for name, cells in zip(s.labels, read.texts, strict=True)}
         ids = tuple(map(str, lines))
         return Dataset(ids, channels, texts, lines, str(s.path), digest, warnings=warnings)
-
-    def _refuse(self, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
-        raise DataError(message, where=Location(str(self._settings.path), line=line, field=column), hint=hint)
