@@ -20,9 +20,9 @@ from armcal.errors import ArmcalError, InputError
 from armcal.io.journal import KeptJournal, has_journal
 from armcal.plugins import use_plugins
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.run_log import Progress, dataset_of, progress_of
-from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
+from armcal_bench.preparation import Prepared, prepare
+from armcal_bench.run_log import Progress, dataset_of, progress_of
+from armcal_bench.session import Outcome, RunOptions, acquire
 
 from tests.simulated_lines.line_world import BOARD, CLOCK
 from tests.simulated_lines.socket_clock import SimulatedClock

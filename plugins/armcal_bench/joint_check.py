@@ -24,16 +24,14 @@ from armcal.errors import ConfigError, InputError
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
-from armcal_bench.acquisition.drive import PathPlanner
-from armcal_bench.acquisition.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
-from armcal_bench.acquisition.run_log import Log, Progress, measured_by
-from armcal_bench.acquisition.session import Ending, opened, ready_run
-from armcal_bench.acquisition.tracker_monitor import Evidence, StopRequested, pose_of
 from armcal_bench.bench import SECTION, Bench, closing
-from armcal_bench.measured_frame import FEWEST, FrameMistake
-from armcal_bench.servo.record import BEGUN, POSE
-from armcal_bench.servo.setup import ANYWHERE, Conversation
-from armcal_bench.servo.tracked_body import (
+from armcal_bench.drive import PathPlanner
+from armcal_bench.evidence import FEWEST, Evidence, FrameMistake
+from armcal_bench.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
+from armcal_bench.run_log import Log, Progress, measured_by
+from armcal_bench.servo_setup import ANYWHERE, BEGUN, POSE, Conversation
+from armcal_bench.session import Ending, opened, ready_run
+from armcal_bench.tracked_body import (
     BODY,
     TABLES,
     Body,
@@ -45,6 +43,7 @@ from armcal_bench.servo.tracked_body import (
     turn_of_point,
     twist_angles,
 )
+from armcal_bench.tracker_monitor import StopRequested, pose_of
 
 _LEVER_M = 0.1
 _STILL = math.radians(1.5)

@@ -16,7 +16,7 @@ import pytest
 from armcal.cli.main import cli
 from armcal.devices.device import DeviceRefusedError
 from armcal.errors import InputError
-from armcal_bench.acquisition.session import RunOptions, acquire
+from armcal_bench.session import RunOptions, acquire
 from click.testing import CliRunner, Result
 
 from tests.bench_runs import CONFIG, BenchRun, overrides_for, positions, write_plan

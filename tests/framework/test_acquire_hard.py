@@ -22,13 +22,13 @@ from armcal.errors import ArmcalError, InputError
 from armcal.io.journal import Journal, JournalFailedError, JournalFullError
 from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.drive import Drive, PathPlanner
-from armcal_bench.acquisition.preparation import Rest
-from armcal_bench.acquisition.session import RunOptions, acquire
-from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
-from armcal_bench.acquisition.tracker_monitor import Arrival, TrackerMonitor
-from armcal_bench.bench import Bench
+from armcal_bench.bench import AcquisitionSettings, ArrivalSettings, Bench, ServoHeatSettings
+from armcal_bench.drive import Drive, PathPlanner
+from armcal_bench.evidence import Arrival
 from armcal_bench.hazards import FirstMotion
+from armcal_bench.preparation import Rest
+from armcal_bench.session import RunOptions, acquire
+from armcal_bench.tracker_monitor import TrackerMonitor
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal_bench.servo.fit import outcome_of
-from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings
-from armcal_bench.servo.tracked_body import RigidArm
+from armcal_bench.servo_fit import outcome_of
+from armcal_bench.servo_setup import KnownServo, ServoCalibrationSettings
+from armcal_bench.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.own_arms import POST, _config

@@ -11,12 +11,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from armcal.errors import DataError, InputError
-from armcal_bench.acquisition.tracker_monitor import StopRequested
 from armcal_bench.keys import QUIT, SERVO_KEYS, OperatorInput, operator_input
-from armcal_bench.servo.outputs import improved
-from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import evaluated, measure
-from armcal_bench.servo.setup import Conversation
+from armcal_bench.servo_outputs import improved
+from armcal_bench.servo_session import evaluated, measure
+from armcal_bench.servo_setup import Conversation, Record
+from armcal_bench.tracker_monitor import StopRequested
 
 from tests.servo_fakes import config_in, setup_on
 

@@ -13,13 +13,12 @@ import yaml
 from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
 from armcal.devices.device import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
-from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.heat import HeatModel, ThermalState
-from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.servo.outputs import improved, write_servo_file
-from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import evaluated, measure
-from armcal_bench.servo.setup import Conversation
+from armcal_bench.drive import Drive
+from armcal_bench.hazards import HeatModel, ThermalState
+from armcal_bench.servo_outputs import improved, write_servo_file
+from armcal_bench.servo_session import evaluated, measure
+from armcal_bench.servo_setup import Conversation, Record
+from armcal_bench.tracker_monitor import StopRequested
 
 from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults

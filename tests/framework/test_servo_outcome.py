@@ -11,9 +11,9 @@ from armcal.arm.servo import PulseClock, PulseTable
 from armcal.config.servo_file import load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.run.experiment import Experiment
-from armcal_bench.servo.fit import outcome_of
-from armcal_bench.servo.outputs import findings, improved, results, write_servo_file
-from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings
+from armcal_bench.servo_fit import outcome_of
+from armcal_bench.servo_outputs import findings, improved, results, write_servo_file
+from armcal_bench.servo_setup import KnownServo, ServoCalibrationSettings
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
 from armcal_bench.joint_check import Move, judged, swapped
-from armcal_bench.servo.tracked_body import RigidArm
+from armcal_bench.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from armcal.devices.live import REPEATED, TrackerFrame
 from armcal.measure.rests import deviations_of_mean, mean_pose
-from armcal_bench.acquisition.settings import SettleSettings
-from armcal_bench.acquisition.tracker_monitor import Settled, Settling, TrackerHealth, drift_of
-from armcal_bench.bench import BodySettings
+from armcal_bench.bench import BodySettings, SettleSettings
+from armcal_bench.tracker_monitor import Settled, Settling, TrackerHealth, drift_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation

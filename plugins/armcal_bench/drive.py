@@ -12,10 +12,10 @@ from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, measured_angles, standing_at, state_of
 
-from armcal_bench.acquisition.heat import HeatModel, ThermalState
-from armcal_bench.acquisition.run_log import ENERGISED, Log
-from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.tracker_monitor import MayMove, unguarded
+from armcal_bench.bench import AcquisitionSettings
+from armcal_bench.hazards import HeatModel, ThermalState
+from armcal_bench.run_log import ENERGISED, Log
+from armcal_bench.tracker_monitor import MayMove, unguarded
 
 _SPREAD = 256
 _TRIED_AT_ONCE = 24

@@ -19,12 +19,10 @@ from armcal.run.experiment import Experiment, clearance_check
 from armcal.run.plan import approach_channels
 from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_beyond
 
-from armcal_bench.acquisition.drive import JointPath, PathPlanner, travel
-from armcal_bench.acquisition.heat import COOLED_TO, NEVER, HeatModel, holding_torques
-from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.tracker_monitor import Arrival
-from armcal_bench.bench import Bench
-from armcal_bench.hazards import HazardJudge
+from armcal_bench.bench import AcquisitionSettings, Bench
+from armcal_bench.drive import JointPath, PathPlanner, travel
+from armcal_bench.evidence import Arrival
+from armcal_bench.hazards import COOLED_TO, NEVER, HazardJudge, HeatModel, holding_torques
 
 _AT = ("bench", "acquisition")
 _SLACK = 1e-9

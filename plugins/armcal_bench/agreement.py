@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import fdtri
 
-from armcal_bench.recording.postures import Posture, dataset_of
+from armcal_bench.postures import Posture, dataset_of
 
 _FAR = 100.0  # Ordinary sizes within which a group (a socket) is looked for
 _MOST_STEPS, _DAMPING = 30, 1e-9

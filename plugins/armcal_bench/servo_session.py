@@ -14,27 +14,30 @@ from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedErro
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError, Location
 
-from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.heat import COOLED_TO
-from armcal_bench.acquisition.run_log import Log, Progress
-from armcal_bench.acquisition.session import opened, ready_run
-from armcal_bench.acquisition.tracker_monitor import Evidence, MotionGate, StopRequested
 from armcal_bench.bench import closing
+from armcal_bench.drive import Drive
+from armcal_bench.evidence import Evidence, FrameMistake
+from armcal_bench.hazards import COOLED_TO
 from armcal_bench.joint_check import BASE, Verdict, answered, between, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
-from armcal_bench.measured_frame import FrameMistake
-from armcal_bench.servo.fit import Outcome, outcome_of
-from armcal_bench.servo.record import (
+from armcal_bench.run_log import Log, Progress
+from armcal_bench.servo_fit import Outcome, outcome_of
+from armcal_bench.servo_setup import (
     ANGLE,
     LEFT_OUT,
+    Conversation,
+    PulsedJoints,
     Record,
+    ServoDevice,
+    Setup,
     SweepLog,
     begin,
     check_same,
     pose_name,
     stated_by,
 )
-from armcal_bench.servo.setup import Conversation, PulsedJoints, ServoDevice, Setup
+from armcal_bench.session import opened, ready_run
+from armcal_bench.tracker_monitor import MotionGate, StopRequested
 
 _FAR_GAIN = 8.0
 """Of lengths: in sweeps of one joint after the other a reversed servo resembles a frame with a smaller one."""

@@ -24,9 +24,8 @@ from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.joint_check import permuted
-from armcal_bench.servo.record import ANGLE, POSE
-from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings, piecewise
-from armcal_bench.servo.tracked_body import (
+from armcal_bench.servo_setup import ANGLE, POSE, KnownServo, ServoCalibrationSettings, piecewise
+from armcal_bench.tracked_body import (
     BODY,
     TABLES,
     Body,

@@ -22,6 +22,8 @@ from armcal.measure.measurement import GroupedMeasurement, Measurement, NamesGro
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
 
+from armcal_bench.run_log import DATASET
+
 _FULL_TURN = 2 * math.pi * (1 + 1e-9)
 _LONG_ENOUGH = 0.8  # Of the window: readings need not fall on its ends
 _MOST = 100_000
@@ -236,7 +238,6 @@ class Labels:
         return ""
 
 
-DATASET = "dataset.csv"
 IMAGES = "images"
 OURS = (DATASET, *JOURNAL_FILES, IMAGES)
 CAPTURED, UNDONE = "captured", "undone"  # Kinds of entries

@@ -14,8 +14,8 @@ from armcal.base.config_text import finite
 from armcal.config.servo_file import BoardSettings, ServoFile, ServoSettings, load_servo_file, servo_file_text
 from armcal.io.plain_files import write_whole, writing
 
-from armcal_bench.servo.fit import FittedServo, Outcome
-from armcal_bench.servo.record import next_name
+from armcal_bench.servo_fit import FittedServo, Outcome
+from armcal_bench.servo_setup import next_name
 
 _FAR_CHANGE = 0.1
 _SAG_WORTH = math.radians(0.1)

@@ -25,13 +25,14 @@ from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 from armcal.plugins import blaming
 
-from armcal_bench.acquisition import run_log
-from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.heat import ThermalLimit
-from armcal_bench.acquisition.preparation import LeaveOut, Measure, Prepared, Rest, Scheduler
-from armcal_bench.acquisition.run_log import EndedHow, Log, Progress, RunLog
-from armcal_bench.acquisition.tracker_monitor import (
-    Evidence,
+from armcal_bench import run_log
+from armcal_bench.bench import closing
+from armcal_bench.drive import Drive
+from armcal_bench.evidence import Evidence
+from armcal_bench.hazards import FirstMotion, ThermalLimit
+from armcal_bench.preparation import LeaveOut, Measure, Prepared, Rest, Scheduler
+from armcal_bench.run_log import EndedHow, Log, Progress, RunLog, Start, opened_journal
+from armcal_bench.tracker_monitor import (
     MotionGate,
     Settled,
     StopRequested,
@@ -41,9 +42,6 @@ from armcal_bench.acquisition.tracker_monitor import (
     pose_of,
     unguarded,
 )
-from armcal_bench.bench import closing
-from armcal_bench.hazards import FirstMotion
-from armcal_bench.journal_folder import Start, opened_journal
 
 T = TypeVar("T")
 WhenStopped = Literal["park", "hold"]

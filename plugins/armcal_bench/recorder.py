@@ -24,11 +24,10 @@ from armcal.io.plain_files import write_over
 from armcal.measure.checks import warn_beyond_limits
 from armcal.plugins import refuse
 
+from armcal_bench.agreement import Assessment, Assessor, contacts_of
 from armcal_bench.bench import Bench, closing
-from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.keys import END, OperatorInput
-from armcal_bench.recording.agreement import Assessment, Assessor, contacts_of
-from armcal_bench.recording.postures import (
+from armcal_bench.postures import (
     IMAGES,
     OURS,
     JointKinds,
@@ -40,6 +39,7 @@ from armcal_bench.recording.postures import (
     dataset_of,
     write_dataset,
 )
+from armcal_bench.run_log import Start, opened_journal
 
 Capture = Literal["keys", "still", "images"]
 """When postures are captured: at a command, when the arm has stood for a while, or when an image comes."""
