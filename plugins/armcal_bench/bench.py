@@ -139,8 +139,6 @@ class BodySettings(Settings):
 
 
 class Capture(NamedTuple):
-    """Some frames, in the arm's base frame."""
-
     # ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation, too, of a tracker of positions
     poses: Array
     faults: tuple[str, ...]  # why a frame does not show it, a sentence; empty where it does (N)
@@ -205,14 +203,12 @@ def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySett
 
 
 def _stacked(frames: Sequence[TrackerFrame], name: str) -> Array:
-    """``world_T_body`` of each frame, NaN where it is not seen (N x 4 x 4)."""
     nothing = np.full((4, 4), np.nan)
     poses = [frame.bodies.get(name) for frame in frames]
     return np.array([nothing if pose is None else pose for pose in poses]).reshape(-1, 4, 4)
 
 
 def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
-    """``world_T_reference`` of each frame (N x 4 x 4)."""
     if not settings.has_base:
         return np.tile(np.eye(4), (len(frames), 1, 1))
     stacked = _stacked(frames, settings.base)
@@ -274,7 +270,6 @@ class Bench:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
-        """The bench of an experiment; ConfigError where none is configured, or it is refused."""
         if experiment.settings.bench is None:
             hint = "Say what moves and measures the arm: bench: {link: ..., device: ..., tracker: ...}."
             raise ConfigError("found no bench.", where=experiment.source.where((SECTION,)), hint=hint)
@@ -282,7 +277,6 @@ class Bench:
 
     @property
     def arm(self) -> Arm:
-        """The only arm; ConfigError where there are several."""
         where, hint = self.experiment.source.where(("arms",)), "Configure each arm's bench on its own."
         return only_arm(self.experiment.system.arms, "a bench moves a single arm", hint, where)
 
@@ -297,7 +291,6 @@ class Bench:
 
     @contextmanager
     def clock(self) -> Iterator[Clock]:
-        """The machine's clock, or the simulated bench's, which ends with it."""
         if self.simulation is None:
             yield RealClock()
             return
@@ -314,12 +307,10 @@ class Bench:
         return built if self.simulation is None else self.simulation.device(built, isinstance(link, GuardedLink))
 
     def tracker(self) -> Tracker:
-        """The tracker; see ``device``."""
         built: Tracker = self._built("tracker")
         return built if self.simulation is None else self.simulation.tracker(built)
 
     def joints(self) -> JointStream:
-        """The stream of joint readings; see ``device``."""
         built: JointStream = self._built("joints")
         return built if self.simulation is None else self.simulation.joints(built)
 

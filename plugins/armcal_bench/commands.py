@@ -126,11 +126,6 @@ def always(motion: FirstMotion) -> bool:
 
 
 def ask(motion: FirstMotion) -> bool:
-    """Whether somebody at the terminal says that the arm may be moved.
-
-    Raises:
-        InputError: there is no terminal to ask at.
-    """
     named = ", ".join(motion.free or motion.measured or motion.powered)
     pulses = "get no pulses yet" if motion.free else "hang free" if motion.measured else "have pulses"
     if not sys.stdin.isatty():
@@ -146,8 +141,6 @@ def ask(motion: FirstMotion) -> bool:
 
 
 def warned(console: Console, question: Question) -> Question:
-    """The question, after what is dangerous has been named: whoever gave --yes reads it too."""
-
     def warn_and_ask(motion: FirstMotion) -> bool:
         for hazard in motion.hazards:
             console.warn(hazard.sentence)
@@ -162,7 +155,6 @@ def waits(console: Console) -> Waits:
 
 
 def energise_option(command: F) -> F:
-    """The option --yes, handed on as ``may_energise``."""
     return click.option(
         "--yes",
         "may_energise",
@@ -296,7 +288,6 @@ def _driven(
 
 
 def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
-    """Time, travel and heat, in a few lines."""
     rests = sum(isinstance(step, Rest) for step in forecast.steps)
     console.line(
         f"{len(prepared.plan)} poses in about {duration(forecast.seconds)}; the joints turn "
@@ -314,7 +305,6 @@ def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForec
 
 
 def _show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) -> int:
-    """How it ended, and what to do next; the exit code."""
     summary, ending = outcome.summary, outcome.ending
     left_out, drift = summary["left_out"], summary["gives_way"]
     console.result(summary)
@@ -342,7 +332,6 @@ def _show_outcome(console: Console, outcome: Outcome, config: Path, out: Path) -
 
 
 def _show_dry_run(console: Console, prepared: Prepared) -> None:
-    """What a run would take, and what is dangerous in it, as far as that is known without a device."""
     joints, unchecked, forecast = prepared.device.joint_names, "", _forecast(prepared)
     measured = joints if isinstance(prepared.device, MeasuringDevice) else ()
     releases = prepared.settings.at_end == "release"
@@ -384,7 +373,6 @@ def _account(bench: Path) -> dict[str, Any]:
 
 
 def _show_account(console: Console, account: dict[str, Any]) -> None:
-    """What the simulated arm had to bear: how often, and the worst of each kind."""
     worst = account.get("worst", {})
 
     def amount(kind: str) -> str:
@@ -619,11 +607,7 @@ def _with_source(source: ConfigSource, part: str, usual: str, option: str, named
 
 @contextmanager
 def _keys(bench: Bench, capture: str) -> Iterator[tuple[OperatorInput, bool]]:
-    """What a person types, and whether that is a terminal; never what the joint readings come from.
-
-    Raises:
-        InputError: no key could start a capture.
-    """
+    """What a person types, and whether that is a terminal; never what the joint readings come from."""
     if (bench.settings.joints or {}).get("source") != STANDARD_INPUT:
         descriptor, opened = sys.stdin.fileno(), None
     else:

@@ -38,35 +38,23 @@ _TINY = 1e-9
 
 @dataclass(frozen=True)
 class MeasuredFrame:
-    """How measured poses lie to the model's: ``p = gain turn mirror (e + R_e target) + shift``.
-
-    Attributes:
-        left: what is not explained, root mean square with the numbers that were fitted taken into account (m, by the
-            model's lengths).
-    """
+    """How measured poses lie to the model's: ``p = gain turn mirror (e + R_e target) + shift``."""
 
     gain: float  # measured lengths, in lengths of the model
     is_mirrored: bool  # whether the frame is left-handed; ``mirror`` is -1 then, else 1
     with_rotations: bool  # whether the measured rotations agree with the model's in this frame; False where none are
-    left: float
+    left: float  # what is not explained (root mean square by degrees of freedom, m of the model's lengths)
 
 
 @dataclass(frozen=True)
 class FrameMistake:
-    """A frame that is not what was configured."""
-
     sentence: str  # what is off, by how much, and by how many poses, without its full stop
     mend: str  # what to do, a full sentence
     frame: MeasuredFrame  # that explains the poses
 
 
 def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
-    """What is wrong with the units or the handedness of measured poses; None where nothing is, or too few tell.
-
-    Args:
-        expected: ``base_T_tool`` by the model (N x 4 x 4, m).
-        seen: as measured, in any frame (N x 4 x 4, m); rotations are NaN where they are not measured.
-    """
+    """What is wrong with the units or the handedness of poses as they were seen in any frame; None where nothing is."""
     if len(seen) < FEWEST:
         return None
     some = np.unique(np.linspace(0, len(seen) - 1, _MOST).astype(int))  # the last alone may hardly move the tool
@@ -194,14 +182,6 @@ class Arrival:
     settings: ArrivalSettings  # the limits
 
     def doubt(self, pose: int, measured: Array, others: Mapping[int, Array]) -> str:
-        """Why the arm is not where it was commanded to be, a sentence; empty if it may be there.
-
-        Args:
-            pose: its index.
-            measured: ``base_T_target`` (4 x 4, m); the rotation is NaN where it is not known.
-            others: those of other poses by index. The one that fits worst decides, or the next where there are five or
-                more: one of them may be wrong itself.
-        """
         places = [place for place in others if place != pose]
         if not places:
             return ""
@@ -218,10 +198,6 @@ class Arrival:
         )
 
     def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
-        """What is wrong with the tracker's units or handedness, by ``base_T_target`` of poses by their index.
-
-        Poses that are not where they were commanded to be count as well: in other units none is.
-        """
         poses = list(measured)
         return frame_mistake(self.expected[poses], np.array([measured[pose] for pose in poses]).reshape(-1, 4, 4))
 
@@ -240,14 +216,11 @@ def _worst(differences: Array) -> float:
 
 @dataclass(frozen=True)
 class Drift:
-    """A motion of the target while the arm should stand."""
-
     speed: float  # root mean square (m/s)
     poses: int  # in how many it was seen
 
     @classmethod
     def of(cls, stands: Sequence[Stand]) -> "Drift | None":
-        """One that most of the stands show, three at least."""
         if len(stands) < _FEWEST_STANDS:
             return None
         rates, sds = (np.array([getattr(stand, name) for stand in stands]) for name in ("rates", "sds"))
@@ -270,14 +243,7 @@ class Drift:
 
 
 class Evidence:
-    """Everything that was measured, of poses that count and of others.
-
-    Args:
-        arrival: compares poses with the model's.
-        is_tolerated: whether the run goes on despite a mistake of the tracker's frame; by default it never does.
-        fewest: poses that show one.
-        restless_ends: whether poses in a row in which the arm does not come to stand end a run, whatever the reason.
-    """
+    """Everything that was measured, of poses that count and of others."""
 
     def __init__(
         self,
@@ -294,7 +260,6 @@ class Evidence:
         self._failed = 0
 
     def stood(self, pose: int, stand: Stand | None) -> None:
-        """How the target moved while the arm should stand in a pose; None where it was hardly seen."""
         if stand is not None:
             self._stands.append((pose, stand))
 
@@ -303,10 +268,6 @@ class Evidence:
         self.doubted.pop(pose, None)
 
     def failed(self, why: str) -> None:
-        """The arm did not come to stand in a pose, or stood elsewhere.
-
-        Raises StopRequested where that happened several times in a row, and the target moves meanwhile.
-        """
         self._failed += 1
         if self._failed < self.arrival.settings.in_a_row:
             return
@@ -317,7 +278,6 @@ class Evidence:
             raise StopRequested(f"{text}: does a servo stall, or let go?", how="failed")
 
     def drift(self, last: int = 0) -> Drift | None:
-        """A motion of the target in the last so many stands, or in all of them."""
         return Drift.of([stand for _, stand in self._stands[-last:]])
 
     def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:

@@ -43,7 +43,6 @@ class HeatModel:
 
     @classmethod
     def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings], torques: Torques) -> Self:
-        """The model of these joints; ValueError where the settings name no such joint."""
         if fault := unknown_joint(settings, joints):
             raise ValueError(fault)
         servos = [settings.get(joint) for joint in joints]
@@ -58,11 +57,9 @@ class HeatModel:
 
     @property
     def cold(self) -> Array:
-        """Warmth of servos that have rested for long (joints x 2)."""
         return np.zeros(self.times.shape)
 
     def heat(self, thermal_state: Array) -> Array:
-        """Of each joint, from the warmth of its parts (joints x 2)."""
         return np.asarray((self.shares * thermal_state).sum(axis=1))
 
     def steady(self, torque: Array) -> Array:
@@ -70,7 +67,6 @@ class HeatModel:
         return np.asarray((torque / self.continuous) ** 2)[:, None]
 
     def after(self, thermal_state: Array, torque: Array, seconds: float) -> Array:
-        """Warmth (joints x 2) after holding a torque (joints, N m) for some time."""
         steady = self.steady(torque)
         return np.asarray(steady + (thermal_state - steady) * np.exp(-seconds / self.times))
 
@@ -135,7 +131,6 @@ class ThermalState:
         return dict(zip(self._joints, self.warmth.tolist(), strict=True))
 
     def check(self) -> None:
-        """Raise ThermalLimit where a servo is above its budget."""
         if self.model.over(self.warmth):
             raise ThermalLimit(f"the servo of {self._hottest[0]} has come to its budget")
 
@@ -167,8 +162,6 @@ _BEYOND = math.radians(0.5)  # A board's counts lie half a degree apart
 
 @dataclass(frozen=True)
 class Hazard:
-    """The worst of its kind."""
-
     kind: str  # ``first_pulse``, ``limits`` or ``drop``
     joint: str  # that turns
     amount: float  # how far (rad)
@@ -181,8 +174,6 @@ class Hazard:
 
 @dataclass(frozen=True)
 class FirstMotion:
-    """What is about to move."""
-
     free: tuple[str, ...]  # joints that hang free and get their first pulses
     powered: tuple[str, ...]  # joints that have pulses
     hazards: tuple[Hazard, ...]  # of the motion, the worst of each kind
@@ -191,14 +182,10 @@ class FirstMotion:
 
 @dataclass(frozen=True, eq=False)
 class HazardJudge:
-    """Judges an arm's motions before they begin."""
-
     joints: tuple[str, ...]  # in the arm's order
     moved: tuple[str, ...]  # those that have servos
     limits: Array  # of the joints (joints x 2, rad)
-    torques: (
-        Torques  # of the load on each joint at joint angles (joints, N m); it turns a limp joint the way of its sign
-    )
+    torques: Torques  # of the load on each joint (joints, N m); it turns a limp joint the way of its sign
     rest: Array  # where the arm parks, or its base pose (joints, rad)
 
     def first_motion(
@@ -209,14 +196,7 @@ class HazardJudge:
         releases: bool,
         measured: Collection[str] = (),
     ) -> FirstMotion:
-        """A run's start and its end.
-
-        Args:
-            standing: the angles (rad) of the joints that have pulses.
-            first: the angles that the others' first pulses ask for, where that is not where the arm rests.
-            releases: whether servos are let go where the arm rests.
-            measured: joints whose servos know where they stand.
-        """
+        """A run's start and its end; limp joints get the ``first`` angles, or those of the rest pose."""
         powered = tuple(joint for joint in self.moved if joint in standing)
         limp = [joint for joint in self.moved if joint not in standing]
         free = tuple(joint for joint in limp if joint not in measured)
@@ -243,7 +223,6 @@ class HazardJudge:
         )
 
     def _outside(self, standing: Mapping[str, float]) -> Hazard | None:
-        """A joint whose pulses ask for an angle beyond its limits."""
         rows = [(i, standing[joint], *self.limits[i]) for i, joint in enumerate(self.joints) if joint in standing]
         amount, i, at = max(((max(low - at, at - high), i, at) for i, at, low, high in rows), default=(0.0, 0, 0.0))
         if amount <= _BEYOND:
@@ -258,7 +237,6 @@ class HazardJudge:
         )
 
     def _drop(self) -> Hazard | None:
-        """How far the arm falls from where it rests, once its servos are let go."""
         fallen = self._fallen
         i = int(np.argmax(np.abs(fallen - self.rest)))
         amount, torque = abs(float(fallen[i] - self.rest[i])), abs(float(self.torques(self.rest)[i]))

@@ -58,8 +58,6 @@ _SURE = 40.0
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a joint did."""
-
     joint: str  # that was commanded
     kind: str  # ``right``, ``reversed``, ``gain``, ``another``, ``still`` or ``unclear``
     sentence: str  # what was seen
@@ -69,11 +67,7 @@ class Verdict:
 
 
 def noted(record: WiringRecord, verdicts: Sequence[Verdict], seen: Mapping[str, Any]) -> None:
-    """Write down as checked the joints that turned as commanded, and as no other joint did.
-
-    Raises:
-        InputError: it cannot be written; what was seen is said.
-    """
+    """Write down as checked the joints that turned as commanded, and as no other joint did."""
     right = [verdict.joint for verdict in verdicts if verdict.kind == "right" and not verdict.other]
     try:
         record.note(right, [verdict.joint for verdict in verdicts if verdict.joint not in right], seen)
@@ -85,10 +79,7 @@ def noted(record: WiringRecord, verdicts: Sequence[Verdict], seen: Mapping[str, 
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """What was seen when a joint was commanded to turn (rad): the tool's pose before and after (4 x 4, base frame).
-
-    Rotations may be NaN.
-    """
+    """The tool's pose before and after a joint was commanded to turn (rad; 4 x 4, base frame; rotations may be NaN)."""
 
     joint: str
     commanded: float
@@ -113,8 +104,6 @@ class Move:
 
 @dataclass(frozen=True)
 class _Wiring:
-    """Which joint each command moves, and with which sign."""
-
     moves: Mapping[str, str]
     signs: Mapping[str, int]
 
@@ -123,21 +112,15 @@ class _Wiring:
         return sum(a != b for a, b in self.moves.items()) + sum(sign < 0 for sign in self.signs.values())
 
     def pose(self, base: Mapping[str, float]) -> dict[str, float]:
-        """Where the joints stand then (rad)."""
         return {self.moves[joint]: self.signs[joint] * angle for joint, angle in base.items()}
 
 
 def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
-    """What each joint did, by all that was seen together.
+    """What each joint did, by all that was seen together, from a base pose as commanded (rad).
 
     A swapped or reversed servo stands elsewhere in the base pose too, so that the axes of the joints after it are not
     where the model has them: each wiring with a few faults is tried, and the one that explains all moves with the
     fewest faults is taken.
-
-    Args:
-        moves: one of each joint that was tried.
-        base: the angles of all joints that the pulses command (rad).
-        nominal: the model.
     """
     seen = [move for move in moves if not move.is_little]
     scored = sorted((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(_wirings(tuple(base))))
@@ -327,7 +310,6 @@ class Zero:
         return len(self.teeth) == 1
 
     def sentence(self, joint: str) -> str:
-        """What it looks like; empty where that is a zero set by hand."""
         if self.is_sure and not self.teeth[0][0] and not self.is_far:
             return ""
         amount = f"{math.degrees(self.value):+.1f} +- {math.degrees(self.sd):.1f} deg"
@@ -342,8 +324,6 @@ class Zero:
 
 @dataclass(frozen=True)
 class JointCheck:
-    """What each joint did, and how far its zero is off (empty where not all turned as commanded)."""
-
     verdicts: Sequence[Verdict]
     zeros: Mapping[str, Zero]
 
@@ -360,8 +340,6 @@ class JointCheck:
 
 @dataclass(frozen=True)
 class Turned:
-    """What was seen of joints that turned a little."""
-
     identity: DeviceIdentity
     moves: Sequence[Move]
     unseen: Sequence[Verdict]  # of joints that were not seen to stand
@@ -369,12 +347,7 @@ class Turned:
     mistake: FrameMistake | None  # of the tracker's frame
 
     def judged(self, base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
-        """What each joint did, from a pose (rad by joint).
-
-        Raises:
-            InputError: not every joint turned as commanded, and the tracker's frame is another one than expected:
-                reversed servos resemble a left-handed one.
-        """
+        """What each joint did; InputError where one seems to turn wrongly in another frame than expected."""
         verdicts = [*(judged(self.moves, base, nominal) if self.moves else []), *self.unseen]
         if self.mistake is None or all(verdict.kind == "right" for verdict in verdicts):
             return verdicts
@@ -390,12 +363,7 @@ def between(poses: Mapping[str, Mapping[str, float]]) -> dict[str, Mapping[str, 
 
 
 def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conversation, clock: Clock) -> Turned:
-    """Drive the poses of ``between`` as a measuring run; ``turns`` are those of the joints (rad).
-
-    Raises:
-        InputError: the board or the tracker is refused, or the tracker gives other units than expected.
-        StopRequested: it was stopped before its end.
-    """
+    """Drive the poses of ``between`` as a measuring run; ``turns`` are those of the joints (rad)."""
     log, options, ids = Log(), talk.options(), prepared.scheduler.ids
     evidence = Evidence(prepared.arrival, lambda mistake: mistake.frame.is_mirrored, 2 * FEWEST)
     with opened(prepared, options, clock, lambda identity: None) as (gate, identity):
@@ -417,11 +385,6 @@ def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conver
 
 
 def check_ended(ending: Ending, progress: Progress, total: int) -> None:
-    """Whether a run through so many poses came to its end.
-
-    Raises:
-        StopRequested: it did not.
-    """
     is_over = len(progress.measured) + len(progress.left_out) >= total
     if ending.how == "held":
         raise StopRequested(ending.sentence, ending.arm)
@@ -433,11 +396,6 @@ def check_joints(experiment: Experiment, talk: Conversation) -> JointCheck:
     """Turn each joint of servos that know where they stand a little, and write down which are checked.
 
     A zero that is far off makes limits and clearances wrong by as much: such a joint does not count as checked.
-
-    Raises:
-        ConfigError: the device does not know where its joints stand, or the arm stands beyond a limit or too near to
-            something.
-        InputError: it cannot be written down. See ``turned_a_little`` for more.
     """
     bench = Bench.of(experiment)
     own = bench.settings.acquisition.model_copy(update={"arrival": ANYWHERE})
@@ -510,12 +468,7 @@ def _judged(
 def _zeros(
     experiment: Experiment, arm: Arm, joints: list[str], poses: tuple[Array, Array], target: Array
 ) -> dict[str, Zero]:
-    """How much the joints' angles are to be enlarged by.
-
-    Args:
-        poses: commanded (N x joints, rad), and measured (N x 4 x 4).
-        target: as stated (3, m, tool frame).
-    """
+    """How much the joints' angles (commanded N x joints, rad; measured N x 4 x 4) are to be enlarged by."""
     commanded, measured = poses
     numbers = {joint: arm.joint_names.index(joint) + 1 for joint in joints}
     names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers.values()]

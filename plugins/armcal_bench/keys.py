@@ -31,17 +31,7 @@ _NAME = "g"
 
 
 class OperatorInput:
-    """Words in the order in which they are typed.
-
-    Args:
-        descriptor: of a terminal (that gives single keys) or a pipe; None: nobody can type.
-        keys: of a terminal, what each key stands for; None: a word a line.
-        at_end: the word that the end of the input stands for, if any.
-        echo: shows text where a name is typed; None: no key begins a name.
-
-    Attributes:
-        ended: nothing will ever come again.
-    """
+    """Words in the order in which they are typed: keys of a terminal, or the lines of a pipe."""
 
     def __init__(
         self,
@@ -51,7 +41,7 @@ class OperatorInput:
         echo: Callable[[str], None] | None = None,
     ) -> None:
         self._descriptor, self._keys, self._at_end, self._echo = descriptor, keys, at_end, echo
-        self.ended = descriptor is None
+        self.ended = descriptor is None  # nothing will ever come again
         self._words: deque[str] = deque()
         self._cutter, self._has_part = LineCutter(_LONGEST), False
         self._decoder, self._pressed = codecs.getincrementaldecoder("utf-8")("replace"), ""
@@ -96,7 +86,6 @@ class OperatorInput:
         self._has_part = not data.endswith(b"\n")
 
     def _press(self, text: str) -> None:
-        """Take keys as far as they are whole; what is no key is passed over."""
         assert self._keys is not None
         self._pressed += text
         while self._pressed:
@@ -114,7 +103,6 @@ class OperatorInput:
             self._pressed = self._pressed[max(len(match), 1) :]
 
     def _letter(self, key: str) -> None:
-        """A letter of a name, its begin or its end."""
         name, echo = self._name, self._echo or (lambda text: None)
         if name is None:
             self._name = ""

@@ -31,8 +31,6 @@ _SAMPLES = 8
 
 @dataclass(frozen=True)
 class Measure:
-    """Go to a pose and measure there."""
-
     pose: int
     path: JointPath
     seconds: float
@@ -41,8 +39,6 @@ class Measure:
 
 @dataclass(frozen=True)
 class Rest:
-    """Go to where the arm parks and wait there."""
-
     path: JointPath
     seconds: float
     thermal_state: Array
@@ -50,8 +46,6 @@ class Rest:
 
 @dataclass(frozen=True)
 class LeaveOut:
-    """A pose that cannot be measured, and why."""
-
     pose: int
     why: str
 
@@ -124,8 +118,6 @@ class Scheduler:
 
 @dataclass(frozen=True)
 class ScheduleForecast:
-    """What a run is expected to take."""
-
     steps: tuple[Next, ...]  # in order
     seconds: float  # from the first move to the last capture
     travel: float  # of the joint that turns most in each move, rad
@@ -153,8 +145,6 @@ def forecast_schedule(scheduler: Scheduler, at: Array, thermal_state: Array, lef
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that a run needs besides its devices."""
-
     bench: Bench
     settings: AcquisitionSettings
     device: JointDevice
@@ -166,12 +156,7 @@ class Prepared:
 
 
 def prepare(experiment: Experiment, plan: Path) -> Prepared:
-    """Read a plan and check it against limits, pulse tables and clearance. Asks no device.
-
-    Raises:
-        ConfigError, PluginError: the bench is refused.
-        DataError: the plan is refused, with the row of the first pose that the arm must not go to.
-    """
+    """Read a plan and check it against limits, pulse tables and clearance. Asks no device."""
     bench = Bench.of(experiment)
     settings, arm, device = bench.settings.acquisition, bench.arm, bench.device()
     if settings.angles == "measured" and not isinstance(device, MeasuringDevice):
@@ -223,16 +208,7 @@ def of_poses(
     limits: Array,
     park: Array,
 ) -> Prepared:
-    """A run through poses (N x joints, rad) that were found to be allowed, as the device can set them.
-
-    Args:
-        bench, settings: of the run.
-        device: it moves all joints of the arm.
-        plan: with the ids of the poses.
-        poses, approaches: see ``Scheduler``.
-        limits: of the joints (joints x 2, rad).
-        park: where the arm rests (joints, rad).
-    """
+    """A run through poses (N x joints, rad) that were found to be allowed, as the device can set them."""
     experiment, arm = bench.experiment, bench.arm
     settable = np.array(
         [
@@ -251,10 +227,6 @@ def of_poses(
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
-    """The run's own, else the plan's, else the arm model's (joints x 2, rad).
-
-    ConfigError where a joint has none, is no joint, or does not turn.
-    """
     source, plan = experiment.source, experiment.settings.plan
     if sliding := [joint for joint, dimension in arm.commanded.items() if dimension != "angle"]:
         text = f"the joint {sliding[0]} slides, expected joints that turn: servos move angles."
@@ -272,7 +244,6 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
 
 
 def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
-    """The angles (joints, rad) that the device can set nearest to the park pose."""
     where, joints = experiment.source.where((*_AT, "park")), device.joint_names
     if unknown := unknown_joint(settings.park, joints):
         raise ConfigError(f"{unknown}.", where=where)
@@ -302,7 +273,6 @@ def check_park(
 
 
 def _nearest_settable(device: JointDevice, pose: Array) -> Array:
-    """The angles (joints, rad) that the device can set nearest to a pose."""
     standing = standing_at(device, dict(zip(device.joint_names, pose.tolist(), strict=True)))
     return np.array([standing[joint] for joint in device.joint_names])
 
@@ -326,7 +296,6 @@ def _outside(pose: Array, limits: Array) -> Mask:
 
 
 def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
-    """What ``plan.clearance`` asks for; None where it is not given. See ``clearance_check`` for what it raises."""
     plan = experiment.settings.plan
     if plan is None or plan.clearance is None:
         return None
@@ -334,7 +303,6 @@ def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
 
 
 def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> HeatModel:
-    """The servos' model; ConfigError where the settings name no such joint, or nothing weighs anything."""
     where = experiment.source.where((*_AT, "heat"))
     if settings.heat and not arm.masses and not experiment.system.environment.payload_mass:
         text = "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything."

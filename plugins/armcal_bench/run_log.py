@@ -29,21 +29,6 @@ Start = Literal["anew", "resume"]
 def opened_journal(
     folder: Path, start: Start, ours: Collection[str], header: Mapping[str, Any], noun: str, same: Mapping[str, str]
 ) -> Iterator[Journal]:
-    """The journal in a folder.
-
-    Args:
-        folder: its place; only files that are called as ``ours`` may be there when it is begun.
-        start: ``anew``, or ``resume`` what is there.
-        ours: names of files.
-        header: what the journal begins with.
-        noun: what it is the journal of.
-        same: entries of the header that must be as they were when it was begun, and what they are called.
-
-    Raises:
-        InputError: there is a journal and ``start`` is not to resume it, or there is none to resume; or it was begun
-            with another header.
-        DataError: it cannot be read.
-    """
     where = Location(str(folder))
     is_there = has_journal(folder)
     if start == "resume" and not is_there:
@@ -79,8 +64,6 @@ EndedHow = Literal["done", "held", "parked", "refused", "failed"]
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands."""
-
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # what was written, by pose id, in order
     left_out: Mapping[str, str] = field(default_factory=dict)  # why, by pose id
     angles: Mapping[str, float] = field(default_factory=dict)  # commanded last (rad, by joint); empty before the first
@@ -89,7 +72,6 @@ class Progress:
     ended: str = ""  # how it ended, if it did: see ``EndedHow``
 
     def after(self, kind: str, content: Mapping[str, Any]) -> Self:
-        """One entry later."""
         if kind == STARTED:
             return replace(self, ended="")
         if kind == MEASURED:
@@ -131,10 +113,7 @@ class Log:
 
 
 class RunLog(Log):
-    """An open journal; ``identity`` is that of the device that the run began with, None where it did not.
-
-    It raises JournalFullError or JournalFailedError once alone: what comes after that is the way home.
-    """
+    """An open journal; that it is full or failed is raised once alone: what comes after that is the way home."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
@@ -174,7 +153,6 @@ def measured_by(experiment: Experiment) -> tuple[str, tuple[str, ...]]:
 
 
 def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str, str]) -> Dataset:
-    """The poses that are measured, in the order of measuring."""
     instance, local = measured_by(experiment)
     arm = next(iter(experiment.system.arms))
     records = list(progress.measured.values())
@@ -217,13 +195,11 @@ def in_order(progress: Progress) -> bool:
 
 
 def write_measured(folder: Path, experiment: Experiment, progress: Progress, digests: Mapping[str, str]) -> None:
-    """Replace the dataset, where a pose is measured; see ``write_outputs``."""
     if progress.measured:
         dataset = dataset_of(experiment, progress, digests)
         write_csv(folder / DATASET, dataset, experiment.request(measured=True).channels)
 
 
 def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summary: Mapping[str, Any]) -> None:
-    """Replace dataset and summary, each whole."""
     write_measured(folder, experiment, progress, summary["digests"])
     write_whole(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())

@@ -43,19 +43,12 @@ Zero = Literal["kept", "measured"]
 
 @dataclass(frozen=True)
 class FittedServo:
-    """A servo's table and backlash.
-
-    Attributes:
-        pulses, pulse_sds: at the knots (s); of a knot that no observation determines the stated pulse, and NaN.
-        lag, lag_sd: half the backlash (rad); None where it was not approached from both sides.
-    """
-
     known: KnownServo  # as it was stated
     angles: tuple[float, ...]  # knots (rad)
-    pulses: tuple[float, ...]
+    pulses: tuple[float, ...]  # at the knots (s); the stated one, and no deviation (NaN), where none is determined
     pulse_sds: tuple[float, ...]
     determined: tuple[bool, ...]  # whether the observations determine the pulse of a knot
-    lag: float | None
+    lag: float | None  # half the backlash (rad); None where it was not approached from both sides
     lag_sd: float
     scatter: float  # of the observed angles about the fit (rad, root mean square)
     scale: float  # the same in units of the stated deviations; deviations are enlarged by it where it is above 1
@@ -67,16 +60,10 @@ class FittedServo:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a record says.
-
-    Attributes:
-        compliances: of the arm's springs (rad/(N m)) by parameter, value and deviation, where they were determined.
-    """
-
     servos: Mapping[str, FittedServo]  # by joint
     clocks: Mapping[str, PulseClock]  # by board, as stated when it was measured
     silent: Mapping[str, str]  # why a joint's table could not be found, by joint
-    compliances: Mapping[str, tuple[float, float]]
+    compliances: Mapping[str, tuple[float, float]]  # of springs (rad/(N m)), value and deviation, by parameter
     undetermined: tuple[str, ...]  # compliances that the observations do not determine
     zero: Zero  # whether stated zeros were kept
     sag_span: Mapping[str, float]  # by joint, how much what the springs give varies over its sweep (rad)
@@ -99,13 +86,7 @@ _CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
 
 @dataclass(eq=False)
 class _Sweep:
-    """What was observed of a joint, and the table that explains it so far.
-
-    Attributes:
-        pulses: of the table at the servo's knots (counts).
-        kept: which lines count.
-        radius: by which an angle about the joint becomes what is compared: of its circle (m), or one.
-    """
+    """What was observed of a joint, and the table that explains it so far."""
 
     known: KnownServo
     lines: Sequence[Entry]
@@ -114,9 +95,9 @@ class _Sweep:
     sds: Array  # of the angle (rad)
     axis: Array  # of the joint, by the model (base frame)
     arms: Array  # from the axis to the body (N x 3, m)
-    pulses: Array
-    kept: Mask
-    radius: float = 1.0
+    pulses: Array  # of the table at the servo's knots (counts)
+    kept: Mask  # which lines count
+    radius: float = 1.0  # by which an angle becomes what is compared: of its circle (m), or one
 
     @property
     def counts(self) -> Array:
@@ -133,7 +114,6 @@ class _Sweep:
 
     @property
     def angles(self) -> Array:
-        """Where the table puts the pulses (rad)."""
         rising = slice(None, None, -1 if self.falls else 1)
         return np.asarray(piecewise(self.pulses[rising], self.known.angles[rising])(self.counts))
 
@@ -192,7 +172,6 @@ def _sweep_of(
     rigid: RigidArm,
     settings: ServoCalibrationSettings,
 ) -> _Sweep | str:
-    """A joint's lines and a first table, or why they show none."""
     joint, tick = servo.joint, clocks[servo.board].tick
     lines = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
     seen = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
@@ -365,10 +344,7 @@ class _TableFit:
         self._compliances = [name for name in free if name.startswith(f"{arm.name}.") and name in names]
 
     def _zeroed(self, joint: str) -> float:
-        """By how much the angles of a first table are beyond those by which its pulse at zero is the stated one (rad).
-
-        The table is moved by that, where zeros are kept.
-        """
+        """How far a first table's angles are beyond those by which its zero is kept (rad); it is moved by that."""
         sweep = self._sweeps[joint]
         if not self._keeps_zero:
             return 0.0
@@ -411,7 +387,6 @@ class _TableFit:
         return free
 
     def _seats(self) -> Array:
-        """How the body sits on the nominal tool, line by line."""
         return np.array(
             [
                 self._rigid.tool({**line["told"], joint: angle})[:3, :3].T @ pose[:3, :3]
@@ -438,7 +413,6 @@ class _TableFit:
         return body_dataset(self._arm.name, angles, poses, (noise, noise), approaches, numbers)
 
     def _parts(self, rows: Array) -> dict[str, Array]:
-        """Columns of all records, joint by joint."""
         ends = np.cumsum([len(sweep.lines) for sweep in self._sweeps.values()])[:-1]
         return dict(zip(self._sweeps, np.split(rows, ends, axis=-1), strict=True))
 
@@ -488,12 +462,10 @@ class _TableFit:
         return np.asarray(hats(0.0) if self._keeps_zero else hats(sweep.angles).mean(axis=0))
 
     def _off(self) -> dict[str, Array]:
-        """What is left of each angle (rad)."""
         parts = self._parts(self._fit.residuals())
         return {joint: sweep.along(parts[joint]) for joint, sweep in self._sweeps.items()}
 
     def servo(self, joint: str) -> FittedServo:
-        """By the last fit; pulses by the stated oscillator."""
         sweep, names, off = self._sweeps[joint], self._names(joint), self._off()[joint]
         sizes = (off / sweep.sds)[sweep.kept]
         freedom = len(sizes) - len(names) - (joint in self._lags) - 1

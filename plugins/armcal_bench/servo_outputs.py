@@ -30,7 +30,6 @@ def is_usable(servo: FittedServo) -> bool:
 
 
 def findings(outcome: Outcome) -> list[str]:
-    """A sentence each, of servos, zeros and springs."""
     texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
     for servo in outcome.servos.values():
         texts += list(_of_servo(servo, outcome))
@@ -112,11 +111,7 @@ _APART = math.radians(0.5)  # Knots that are nearer to the end of a shortened ta
 
 
 def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
-    """The servo file with the fitted numbers.
-
-    Boards whose adapter was not stated get the one that they were measured on (empty: not known). Of each table that
-    part is kept that is in its servo's pulse range.
-    """
+    """The servo file with the fitted tables, within pulse ranges; boards without an adapter get that of the record."""
     stated = {"id": adapter}
     boards = {name: board if board.id else board.model_copy(update=stated) for name, board in file.boards.items()}
     servos = dict(file.servos)
@@ -131,7 +126,6 @@ def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
 def _fitted_table(
     fitted_servo: FittedServo, servo: ServoSettings, outcome: Outcome, board: BoardSettings
 ) -> PulseTable | None:
-    """The table that is written for a servo that was measured; None where none can be, and its own is kept."""
     if not is_usable(fitted_servo):
         return None
     # Counts stay what they are: the file's board may have another oscillator than that of the record.
@@ -142,7 +136,6 @@ def _fitted_table(
 
 
 def _allowed_part(table: PulseTable, servo: ServoSettings, board: BoardSettings) -> PulseTable | None:
-    """The part of a table whose pulses (s) servo and board allow; None where nothing is left."""
     allowed, longest = servo.pulse_range, board.clock.longest_pulse
     low, high = max(allowed[0], min(table.pulses)), min(allowed[1], longest, max(table.pulses))
     if (low, high) == (min(table.pulses), max(table.pulses)):
@@ -156,13 +149,10 @@ def _allowed_part(table: PulseTable, servo: ServoSettings, board: BoardSettings)
 
 
 def write_servo_file(path: Path, file: ServoFile) -> Path | None:
-    """Put a servo file in place whole; the one before is kept beside it. Where that is, None if nothing changed.
+    """Put a servo file in place whole, and keep the one before, whose place is given; None if nothing changed.
 
     Of a part that stands on one line, as armcal writes it, only that line changes, up to its comment. Where a part
     stands otherwise, the whole file is written anew.
-
-    Raises:
-        InputError: it cannot be written; the one before is as it was.
     """
     path = path.resolve()  # of a link, what it leads to
     with writing(path, "Make it writable and give the command again: nothing measured is lost."):
@@ -205,7 +195,6 @@ def _is_written(fitted_servo: FittedServo, outcome: Outcome, changed: ServoFile)
 
 
 def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
-    """Of tables that reach less far than they were stated to, or than they were to be given for."""
     sentences = []
     for joint, fitted_servo in outcome.servos.items():
         servo, stated = changed.servos[joint], fitted_servo.known.table.angles
@@ -228,11 +217,6 @@ def _narrowed(outcome: Outcome, changed: ServoFile) -> list[str]:
 
 
 def write_results(folder: Path, summary: Mapping[str, Any]) -> None:
-    """The results beside the record.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
     with writing(folder, "Give another --out."):
         write_whole(folder / RESULTS, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
 

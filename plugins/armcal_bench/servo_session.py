@@ -48,13 +48,7 @@ Tables = Mapping[str, tuple[PulseTable, PulseClock]]
 
 
 def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
-    """Measure all that the record in a folder does not hold yet: ``automatic`` by the tracker, or ``guided``.
-
-    Raises:
-        InputError: the folder, the board or the tracker is refused.
-        StopRequested: it was stopped before its end; what was measured is kept.
-        DeviceError: the device is gone; what was measured is kept.
-    """
+    """Measure all that the record in a folder does not hold yet: ``automatic`` by the tracker, or ``guided``."""
     with Record(folder) as record, setup.bench.clock() as clock:
         tables = {joint: setup.table_of(joint) for joint in setup.base}
         if record.begun is not None:
@@ -71,11 +65,6 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
 
 
 def evaluated(setup: Setup, folder: Path) -> Outcome:
-    """The tables of the record in a folder, from the tables that it was begun with.
-
-    Raises:
-        InputError: there is no record, or nothing in it.
-    """
     record = Record(folder)
     if record.begun is None:
         raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
@@ -84,10 +73,7 @@ def evaluated(setup: Setup, folder: Path) -> Outcome:
 
 
 def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int]]:
-    """Counts and the sign of the pulses' change towards them: rising first, then falling.
-
-    As many of the range as leave room to come from either side.
-    """
+    """Counts of a sweep with room to come from either side, rising first, and the sign of the pulses' change."""
     low, high = setup.ranges[joint]
     margin = setup.settings.approach
     shortest, longest = setup.pulses_of(joint)
@@ -103,7 +89,6 @@ def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int
 
 
 def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record) -> None:
-    """Drive the sweeps that are left as a measuring run; the arm ends in its base pose."""
     device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
     poses: dict[str, tuple[dict[str, float], dict[str, int]]] = {}
     planned: dict[str, list[str]] = {joint: [] for joint in setup.joints}
@@ -155,11 +140,7 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
 def _directed(
     setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record | None = None, releases: bool = False
 ) -> Iterator["Directed"]:
-    """An arm that somebody moves joint by joint, in its base pose; it holds when it is stopped.
-
-    Raises:
-        DeviceRefusedError: no way to the base pose is clear from where it stands.
-    """
+    """An arm that somebody moves joint by joint, in its base pose; it holds when it is stopped."""
     device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
     prepared, settings = setup.run(device, {BASE: ({}, {})}), setup.acquisition
     gate = MotionGate(None, clock, settings.lost, talk.asked_to_stop, talk.waits)
@@ -208,7 +189,6 @@ class Directed:
         return side if self.device.rises(joint) else -side
 
     def go(self, joint: str, counts: int) -> None:
-        """Move a joint to a pulse, no faster than allowed; see ``Drive.go`` for what it raises."""
         goal = self.drive.at.copy()
         goal[self.drive.joints.index(joint)] = self.device.angle(joint, counts)
         self.drive.go((self.drive.at, goal), self.gate.resting)
@@ -220,11 +200,6 @@ class Directed:
         self.go(joint, counts)
 
     def next_word(self, operator: OperatorInput) -> str:
-        """What the operator types next; the arm holds until then.
-
-        Raises:
-            StopRequested: it is the end.
-        """
         while True:
             word = operator.next(_LOOK_S)
             word = word and word.strip().lower()
@@ -259,12 +234,6 @@ class Guided:
     say: Callable[[str], None]
 
     def run(self, targets: list[Target]) -> None:
-        """Ask for all that is left.
-
-        Raises:
-            StopRequested: somebody stopped it; the arm holds.
-            DeviceError: the device fails.
-        """
         done, place = done_in(self.record), 0
         while place < len(targets):
             if targets[place].key in done:
@@ -322,10 +291,7 @@ class Guided:
 
 
 def targets_of(setup: Setup) -> list[Target]:
-    """Each joint at its knots, as far as its range leaves room to come from aside, once from either side.
-
-    A range without such room is measured in its middle.
-    """
+    """Each joint at its knots, from either side, as far as its range leaves room for that; else in its middle."""
     targets = []
     for joint in setup.joints:
         low, high = setup.ranges[joint]
@@ -336,18 +302,12 @@ def targets_of(setup: Setup) -> list[Target]:
 
 
 def done_in(record: Record) -> set[tuple[str, int, int]]:
-    """Keys of the targets that a record has."""
     lines = [entry for entry in record.entries if "target" in entry]
     return {Target(line["joint"], line["target"], line["came"]).key for line in lines}
 
 
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
-    """Move each joint a little, and judge what it did; ``seen`` by the ``tracker`` or by ``somebody``.
-
-    Joints that turned as commanded, and as no other joint did, are written down as checked beside the servo file.
-
-    Raises: as ``measure``.
-    """
+    """Move each joint a little, judge by ``tracker`` or ``somebody`` what it did, and note which are checked."""
     record = WiringRecord.of_servo_file(setup.path, setup.file)
     tables = {joint: setup.table_of(joint) for joint in setup.base}
     turns = {joint: _small_turn(setup, joint) for joint in setup.joints}
@@ -389,10 +349,7 @@ def _small_turn(setup: Setup, joint: str) -> float:
 
 
 def park(setup: Setup, talk: Conversation, how: str) -> None:
-    """Bring the servos to the base pose, and with ``release`` end their pulses, the tip's first.
-
-    Raises: as ``measure``.
-    """
+    """Bring the servos to the base pose, and with ``release`` end their pulses, the tip's first."""
     tables = {joint: setup.table_of(joint) for joint in setup.base}
     with setup.bench.clock() as clock, _directed(setup, clock, talk, tables, releases=how == "release") as arm:
         arm.drive.hold()

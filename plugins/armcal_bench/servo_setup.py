@@ -54,40 +54,26 @@ PulseRange = Annotated[tuple[float, float], UnitOf("time")]
 
 
 class ServoCalibrationSettings(Settings):
-    """What ``armcal servo`` measures, and how. When the arm stands is as in ``acquisition.settle``.
-
-    Attributes:
-        knots: the angles that all tables are to be given at; without them each table keeps its own, and its ends reach
-            as far as the joint is measured.
-        base: where the other joints stand while one is measured; joints that are not named stand at zero.
-        ranges: over which joints are moved; the limits of ``acquisition`` or ``plan`` where none are given here.
-        approach: how far a joint comes from below or above before it is measured, so that its play is taken up.
-        pulses: no pulse outside this range is ever set, nor one outside the servo's own ``pulse_range``.
-        rate_deg_per_s: the fastest that a joint is moved, by its stated table.
-        zero: ``kept``: each servo's pulse at zero stays; ``model``: angles are absolute, by the model and the tracker.
-        sag: what springs give is taken from the model's compliances, fitted with the tables, or not reckoned with.
-        sag_sd: how far compliances may well be from the model's, where they are fitted.
-        silence: after this silence of the host a board that can brings the arm back to the base pose.
-    """
+    """What ``armcal servo`` measures, and how. When the arm stands is as in ``acquisition.settle``."""
 
     servos: InputPath | None = None  # the servo file to improve; the device's own where it is not given
     joints: tuple[str, ...] = ()  # those to calibrate; all of the servo file
-    knots: Angles = ()
-    base: dict[str, Angle] = Field(default_factory=dict)
-    ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    knots: Angles = ()  # of all tables; without them each keeps its own, its ends as far as the joint is measured
+    base: dict[str, Angle] = Field(default_factory=dict)  # where joints stand while another is measured; others at zero
+    ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)  # else the limits of the run
     step: PositiveAngle = math.radians(10)  # between the angles of a sweep, or of a guided calibration
-    approach: PositiveAngle = math.radians(4)
-    pulses: PulseRange = (500e-6, 2600e-6)
+    approach: PositiveAngle = math.radians(4)  # from how far a joint comes, so that its play is taken up
+    pulses: PulseRange = (500e-6, 2600e-6)  # no other is ever set, nor one outside the servo's ``pulse_range``
     rate_deg_per_s: Annotated[float, Field(gt=0, le=60)] = 20.0
     period: PositiveDuration = 0.02  # between two steps of a motion
-    zero: Literal["kept", "model"] = "kept"
-    sag: Literal["none", "model", "fitted"] = "fitted"
-    sag_sd: Annotated[Compliance, Field(gt=0)] = 0.2
+    zero: Literal["kept", "model"] = "kept"  # the pulse at zero stays, or angles are absolute by model and tracker
+    sag: Literal["none", "model", "fitted"] = "fitted"  # which compliances give what the springs take out
+    sag_sd: Annotated[Compliance, Field(gt=0)] = 0.2  # how far fitted ones may well be from the model's
     rotation_sd: PositiveAngle = math.radians(0.03)  # of a settled rotation about an axis
     least_radius: Length = 0.03  # of a circle that shows an angle, where a tracker sees positions only
     guided_sd: PositiveAngle = math.radians(0.5)  # how well a joint is put at an angle by eye
     check: PositiveAngle = math.radians(10)  # how far ``--check`` moves a joint
-    silence: PositiveDuration = 1.0
+    silence: PositiveDuration = 1.0  # of the host, after which a board that can goes back to the base pose
 
     @model_validator(mode="after")
     def _usable(self) -> Self:
@@ -106,30 +92,20 @@ ReportProgress = Callable[[str, int, int], None]  # Takes the joint, and how man
 
 @dataclass(frozen=True)
 class Conversation:
-    """How a calibration speaks with whom it is for.
-
-    Attributes:
-        may_energise: whether the arm may be moved; called once before anything moves, with what is
-            about to move and what is dangerous in it.
-    """
-
     asked_to_stop: Callable[[], bool]  # whether somebody wants it to hold and end
-    may_energise: Callable[[FirstMotion], bool]
+    may_energise: Callable[[FirstMotion], bool]  # called once before anything moves, with what is dangerous in it
     report: ReportProgress  # takes how far a tracked calibration is
     say: Callable[[str], None]  # takes a line, of a guided one
     operator: Callable[[], AbstractContextManager[OperatorInput]]  # what somebody types, while it is asked for
     waits: Waits = field(default_factory=Waits)  # says what is waited for
 
     def options(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> RunOptions:
-        """Those of a measuring run, of which a calibration is one."""
         stop, may = self.asked_to_stop, self.may_energise
         return RunOptions(Path(), "anew", stop, may, on_progress, unchecked=True, when_stopped="hold", waits=self.waits)
 
 
 @dataclass(frozen=True)
 class KnownServo:
-    """A servo as its table states it."""
-
     joint: str  # that it turns
     board: str  # that drives it
     table: PulseTable  # as stated; pulses by the board's oscillator
@@ -140,7 +116,6 @@ class KnownServo:
         return np.array(self.knots or self.table.angles)
 
     def pulses_at(self, angles: Array) -> Array:
-        """The stated table's pulses (s) at angles (rad)."""
         return np.asarray(piecewise(np.array(self.table.angles), np.array(self.table.pulses))(angles))
 
 
@@ -172,11 +147,6 @@ class Setup:
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
-        """Of an experiment's bench.
-
-        Raises:
-            ConfigError: the bench, its servo section or the servo file is refused, or the base pose is not clear.
-        """
         bench = Bench.of(experiment)
         settings = ServoCalibrationSettings()
         if bench.settings.servo is not None:
@@ -216,10 +186,7 @@ class Setup:
         return servo.table, self.file.boards[servo.board].clock
 
     def knots_of(self, joint: str) -> tuple[float, ...]:
-        """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range.
-
-        So the table of a servo that turns farther than the others is not cut to theirs.
-        """
+        """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range."""
         if self.settings.knots:
             return self.settings.knots
         stated, (low, high) = self.file.servos[joint].angles, self.ranges[joint]
@@ -228,7 +195,6 @@ class Setup:
         return (ends[0], *inner, ends[1])
 
     def pulses_of(self, joint: str) -> tuple[float, float]:
-        """The shortest and the longest pulse (s) that may be set: the servo's range, and what is configured."""
         borne, allowed = self.file.servos[joint].pulse_range, self.settings.pulses
         return max(borne[0], allowed[0]), min(borne[1], allowed[1])
 
@@ -239,11 +205,6 @@ class Setup:
     def _clear_ranges(
         self, experiment: Experiment, limits: Mapping[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
-        """How far each joint may go from the base pose, within its limits and table and without coming too near.
-
-        Raises:
-            ConfigError: the base pose is not allowed; half of the joints in it would be worse than none.
-        """
         where = experiment.source.where((*AT, "base"))
         for joint, angle in self.base.items():
             (shortest, longest), pulse = self.pulses_of(joint), float(self.file.servos[joint].table.pulse(angle))
@@ -318,13 +279,7 @@ class ServoDevice(JointDevice, PulseDevice, Protocol):
 
 
 class PulsedJoints(JointDevice):
-    """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end.
-
-    Args:
-        setup: which pulses may be set, and the tables by which the device has its angles.
-        device: whose pulses are set.
-        tables: with their boards' clocks, by joint.
-    """
+    """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end."""
 
     def __init__(self, setup: Setup, device: ServoDevice, tables: Mapping[str, tuple[PulseTable, PulseClock]]) -> None:
         self._setup, self._device, self._tables = setup, device, tables
@@ -386,14 +341,12 @@ class PulsedJoints(JointDevice):
         self._device.close()
 
     def angle(self, joint: str, counts: int) -> float:
-        """Where a pulse puts a joint by its table (rad)."""
         return float(self._tables[joint][0].angle(self.pulse(joint, counts)))
 
     def pulse(self, joint: str, counts: int) -> float:
         return counts * self._tables[joint][1].tick
 
     def counts(self, joint: str, angle: float) -> int:
-        """The counts that the table gives for an angle (rad)."""
         return _counts(*self._tables[joint], angle)
 
     def turn_counts(self, joint: str, turn: float) -> int:
@@ -406,7 +359,6 @@ class PulsedJoints(JointDevice):
         return pulses[0] < pulses[-1]
 
     def _own(self, angles: Mapping[str, float]) -> dict[str, float]:
-        """Angles as the device has them, within its tables."""
         own = {}
         for joint, angle in angles.items():
             table = self._setup.table_of(joint)[0]
@@ -415,11 +367,6 @@ class PulsedJoints(JointDevice):
         return own
 
     def _allowed(self, joint: str, angle: float) -> int:
-        """The counts for an angle (rad).
-
-        Raises:
-            DeviceRefusedError: the pulse is outside the range that is allowed.
-        """
         counts, (low, high) = self.counts(joint, angle), self._setup.pulses_of(joint)
         if not low <= self.pulse(joint, counts) <= high:
             raise DeviceRefusedError(
@@ -520,12 +467,7 @@ _LINES: TypeAdapter[_Line] = TypeAdapter(Annotated[_Begun | _Pose | _Angle | _Le
 
 
 class Record:
-    """The observations in a folder's journal; what is there is read and checked at once, and written to when needed.
-
-    Raises:
-        DataError: an entry is not one of ours, or damaged.
-        InputError: it cannot be read.
-    """
+    """The observations in a folder's journal; what is there is read at once, and written to when needed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.path = folder, folder / JOURNAL
@@ -548,15 +490,10 @@ class Record:
 
     @property
     def begun(self) -> Mapping[str, Any] | None:
-        """The first entry; None where there is none."""
         return self._entries[0] if self._entries else None
 
     def set_aside(self) -> Path:
-        """Keep the journal under another name, which is given, and be empty.
-
-        Raises:
-            InputError: it cannot be renamed, or another process writes it.
-        """
+        """Keep the journal under another name, which is given, and be empty."""
         self._opened()
         self._close()
         kept = next_name(self.path)
@@ -566,7 +503,6 @@ class Record:
         return kept
 
     def append(self, kind: str, values: Mapping[str, Any]) -> None:
-        """One more entry, durable when this returns; see ``Journal`` for what it raises."""
         self._opened().record(kind, dict(values))
         self._entries.append({"kind": kind, **values})
 
@@ -642,10 +578,7 @@ def next_name(path: Path) -> Path:
 
 
 def begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
-    """The first entry of a record: by which tables and in which base pose it is measured.
-
-    It is written when nothing is left that could refuse the run.
-    """
+    """The first entry of a record; it is written when nothing is left that could refuse the run."""
     if record.begun is None:
         servos = {joint: _as_stated(setup, joint) for joint in setup.base}
         content = {"servos": servos, "device": device.name, "adapter": device.adapter, "base": dict(setup.base)}
@@ -653,11 +586,6 @@ def begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
 
 
 def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
-    """A record goes on only with the board, the wiring and the base pose that it began with.
-
-    Raises:
-        InputError: it would be another one.
-    """
     begun = record.begun
     if begun is None:
         return

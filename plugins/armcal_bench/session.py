@@ -60,8 +60,6 @@ class ReconnectError(Exception):
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended, a sentence why, and what the arm does then where it does not park."""
-
     how: EndedHow
     sentence: str
     arm: str = "the arm holds"
@@ -89,11 +87,7 @@ class AcquisitionRun:
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
     def run(self) -> Ending:
-        """To its end; whatever happens on the way, the arm is held or parked.
-
-        Raises:
-            ArmcalError: the journal cannot be written, for one; the arm is parked by then, where it can be.
-        """
+        """To its end; whatever happens on the way, the arm is held or parked."""
         try:
             try:
                 self._persist(self._energise)
@@ -120,12 +114,7 @@ class AcquisitionRun:
         self._drive.energise(self._log.progress.angles)
 
     def _persist(self, action: Callable[[], T], restore: Callable[[], None] | None = None) -> T:
-        """Do it; when the device fails, hold until it is back and energised (or ``restore``), and do it again.
-
-        Raises:
-            ReconnectError: it does not come back, or fails again at once, time after time.
-            DeviceUnwellError: it works, and the arm is to be parked.
-        """
+        """Do it; when the device fails, hold until it is back and energised (or ``restore``), and do it again."""
         while True:
             try:
                 result: T = blaming(action)()
@@ -218,7 +207,6 @@ class AcquisitionRun:
 
     @property
     def known(self) -> dict[int, Array]:
-        """``base_T_target`` (4 x 4, m) of measured poses, by their index."""
         measured = self._log.progress.measured
         return {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
 
@@ -231,7 +219,6 @@ class AcquisitionRun:
         return False
 
     def _accept(self, pose: int, settled: Settled) -> None:
-        """Write down where the arm stands, unless that is not where it was commanded to."""
         drive = self._drive
         commanded, readings = drive.standing(), [drive.measured() for _ in range(_READINGS)]
         measured = {joint: sum(reading[joint] for reading in readings) / _READINGS for joint in readings[0]}
@@ -298,7 +285,6 @@ class AcquisitionRun:
         self._on_progress(self._log.progress)
 
     def _hold_and_end(self, why: str) -> Ending:
-        """Stay, should the host fall silent too."""
         try:
             self._drive.hold()
         except DeviceError:
@@ -306,7 +292,6 @@ class AcquisitionRun:
         return self._end("held", why)
 
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
-        """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
             if not self._persist(self._park):
                 return self._end("held", f"{why}; no clear path to where it parks was found")
@@ -317,7 +302,6 @@ class AcquisitionRun:
         return self._end(how, why)
 
     def _park(self) -> bool:
-        """Whether a clear path to where the arm parks was found, and gone."""
         path = self._drive.path_home(self._drive.at)
         if path is None:
             return False
@@ -339,8 +323,6 @@ _SAME = {"plan": "plan", "config": "configuration"}
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is done, and who hears of it."""
-
     folder: Path  # where everything of it is kept
     start: Start  # ``anew``, or ``resume`` what is there
     asked_to_end: Callable[[], bool]  # whether somebody wants it parked
@@ -353,20 +335,12 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended, and its summary as it was written."""
-
     ending: Ending
     summary: dict[str, Any]
 
 
 def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
-    """Drive the plan.
-
-    Raises:
-        InputError: the folder, the board or the tracker is refused; nothing was moved.
-        DeviceError: the board does not answer at all.
-        ArmcalError: the journal cannot be written; the arm was parked.
-    """
+    """Drive the plan."""
     experiment, ids = prepared.bench.experiment, prepared.scheduler.ids
     run_log.measured_by(experiment)
     header = _header(prepared, plan)
@@ -439,7 +413,6 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
 def opened(
     prepared: Prepared, options: RunOptions, clock: Clock, check: Callable[[DeviceIdentity], None]
 ) -> Iterator[tuple[MotionGate, DeviceIdentity]]:
-    """With device and tracker, both alive; nothing moves. ``check`` may refuse a device."""
     device, monitor, now = prepared.device, TrackerMonitor(prepared.bench, clock), clock.now
     with closing(monitor, device):
         identity = open_device(device, clock)
@@ -468,7 +441,6 @@ def ready_run(
     identity: DeviceIdentity,
     evidence: Evidence,
 ) -> AcquisitionRun:
-    """A run that may energise the arm; InputError where it may not."""
     settings, scheduler, progress = prepared.settings, prepared.scheduler, log.progress
     device, clock = prepared.device, gate.clock
     drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)

@@ -33,15 +33,8 @@ _LEAST_RATE = 1e-7  # m/s: what is rounded more coarsely than its noise has no d
 
 @dataclass(frozen=True)
 class Settled:
-    """Where the arm stands.
-
-    Attributes:
-        deviations: standard deviations of the mean (6): x, y, z in the base frame (m), and the turn about each axis of
-            the target (rad). A coordinate that the tracker rounds more coarsely than its noise may have none.
-    """
-
     base_T_target: Array  # the mean (4 x 4, m); the rotation is NaN where the tracker gives only positions
-    deviations: Array
+    deviations: Array  # of the mean: x, y, z (m) and turns about the target's axes (rad); NaN where none is known (6)
     frames: int  # how many frames it is the mean of
     rejected: int  # how many more were set aside, lying far from the others
     begun: float  # when the first of them came, by the bench's clock (s)
@@ -49,15 +42,12 @@ class Settled:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Where it stands, to be written down; see ``pose_of``."""
         rotation, position = self.base_T_target[:3, :3], self.base_T_target[:3, 3]
         return {"position": position.tolist(), "rotation": None if np.isnan(rotation).any() else rotation.tolist()}
 
 
 @dataclass(frozen=True)
 class Stand:
-    """How the target moved while the arm was commanded to stand."""
-
     base_T_target: Array  # in the middle of that time (4 x 4, m); the rotation is NaN where it is not known
     rates: Array  # along x, y, z of the base frame (m/s)
     sds: Array  # standard deviations of these
@@ -84,7 +74,6 @@ class Settling:
         self._begun = -np.inf
 
     def begin(self, now: float) -> None:
-        """The arm was commanded to stand just now (s, by the bench's clock): what came before does not count."""
         self._begun = now
         self._frames.clear()
 
@@ -121,7 +110,6 @@ class Settling:
         return Settled(mean, deviations_of_mean(poses, mean), len(kept), rejected, kept[0].arrived, kept[-1].arrived)
 
     def stand(self) -> Stand | None:
-        """How the target has moved since the arm was commanded to stand; None where it was hardly seen."""
         usable, poses, _ = self._seen(self._begun + self._settings.wait)
         if len(usable) < max(self._settings.frames, _FEWEST):
             return None
@@ -136,7 +124,6 @@ class Settling:
         return usable, capture.poses[[not fault for fault in faults]], faults
 
     def _too_few(self, times: list[float], faults: list[str], start: float, now: float) -> str:
-        """Why the usable frames do not cover the window; empty if they do."""
         s = self._settings
         unusable = Counter(fault for fault in faults if fault).most_common(1)
         reason = unusable[0][0] if unusable else "the tracker is silent" if not faults else "nothing more comes"
@@ -149,10 +136,7 @@ class Settling:
 
 
 def drift_of(times: Array, poses: Array) -> Stand | None:
-    """By straight lines of least squares through positions of poses (N x 4 x 4, m) at times (N, s, rising).
-
-    None for one moment.
-    """
+    """By straight lines of least squares through positions (m) at times (N, s, rising); None for one moment."""
     middle, mean, span = times - times.mean(), mean_pose(poses), float(times[-1] - times[0])
     if span <= 0:
         return None
@@ -197,10 +181,7 @@ def duration(seconds: float) -> str:
 
 
 class TrackerHealth:
-    """Fed with all frames of a tracker from a moment on (s, by the bench's clock).
-
-    A base body that stands still may be out of sight while the arm moves, for ``longest_s``.
-    """
+    """Whether frames are usable; a base body that stands still may be out of sight for ``longest_s``."""
 
     def __init__(self, bodies: BodySettings, begun: float, longest_s: float = float("inf")) -> None:
         self._bodies, self._longest = bodies, longest_s if bodies.base_motion == "still" else 0.0
@@ -247,15 +228,12 @@ class TrackerHealth:
 
 
 class TrackerMonitor:
-    """Feeds every frame to what judges whether the arm stands, and to what judges the tracker."""
-
     def __init__(self, bench: Bench, clock: Clock) -> None:
         self._clock, self._tracker, bodies = clock, bench.tracker(), bench.settings.bodies
         self._settling = Settling(bench.settings.acquisition.settle, bodies)
         self._health = TrackerHealth(bodies, clock.now(), bench.settings.acquisition.lost.park)
 
     def open(self) -> None:
-        """Begin to listen; see ``Tracker.open`` for what it raises."""
         self._tracker.open(self._clock)
 
     def look(self) -> None:
@@ -264,7 +242,6 @@ class TrackerMonitor:
         self._settling.feed(frames)
 
     def trouble(self) -> tuple[float, str]:
-        """See ``TrackerHealth.trouble``."""
         return self._health.trouble(self._clock.now())
 
     def begin(self) -> None:
@@ -273,11 +250,9 @@ class TrackerMonitor:
         self._settling.begin(self._clock.now())
 
     def settled(self) -> Settled | str:
-        """The mean, once the arm stands; else why it is not known to stand."""
         return self._settling.state(self._clock.now())
 
     def stand(self) -> Stand | None:
-        """How the target has moved since ``begin``; None where it was hardly seen."""
         return self._settling.stand()
 
     def close(self) -> None:
@@ -285,10 +260,7 @@ class TrackerMonitor:
 
 
 class StopRequested(Exception):  # noqa: N818 - no error: somebody or something wants the run to end
-    """The run is to end before everything is measured.
-
-    The message says why, ``arm`` what the arm does then, and ``how`` how the run ends (see ``EndedHow``).
-    """
+    """The run is to end, ``how`` (see ``EndedHow``), and ``arm`` is what the arm does then."""
 
     def __init__(self, why: str, arm: str = "the arm holds", how: EndedHow = "parked") -> None:
         super().__init__(why)
@@ -342,10 +314,7 @@ class MotionGate:
     def settled(
         self, tick: Callable[[MayMove], bool], longest_s: float, check_heat: Callable[[], None]
     ) -> Settled | str:
-        """Where the target stands, once the arm does; why it is not known, if the arm does not come to stand in time.
-
-        Raises as ``measuring`` and ``check_heat``.
-        """
+        """Where the target stands, once the arm does; else why it is not known."""
         now, monitor = self.clock.now, self.monitor
         assert monitor is not None
         monitor.begin()
