@@ -1,6 +1,5 @@
 """What a servo calibration is about: the servos of a file, the arm that they move, and where it may go."""
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
-from armcal.arm.servo import COUNTS, PulseClock, PulseTable
+from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, Compliance, Duration, InputPath, Length, Settings, UnitOf
@@ -29,10 +28,10 @@ from armcal.devices.device import (
 )
 from armcal.devices.wiring import servo_file_of
 from armcal.errors import ConfigError, DataError, InputError, Location
-from armcal.io.journal import JOURNAL, Entry, Journal, KeptJournal, has_journal
+from armcal.io.journal import JOURNAL, Journal, KeptJournal, has_journal
 from armcal.io.plain_files import writing
 from armcal.run.experiment import Experiment
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, model_validator
 from scipy.interpolate import BSpline, make_interp_spline
 from typing_extensions import override
 
@@ -391,81 +390,6 @@ _SAME = 1e-6
 _ROTATION_OFF = 1e-6
 
 
-Counts = Annotated[int, Field(gt=0, lt=COUNTS)]
-Row = tuple[float, float, float]
-
-
-class _Line(BaseModel):
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
-
-
-class _StatedServo(_Line):
-    board: str
-    channel: int
-    oscillator_hz: Annotated[float, Field(gt=0)]
-    prescale: int
-    angles: tuple[float, ...]
-    pulses: tuple[float, ...]
-
-    @model_validator(mode="after")
-    def _usable(self) -> Self:
-        PulseTable(self.angles, self.pulses)
-        PulseClock(self.oscillator_hz, self.prescale)
-        return self
-
-
-class _Begun(_Line):
-    kind: Literal["begun"]
-    servos: Annotated[dict[str, _StatedServo], Field(min_length=1)]
-    base: dict[str, float]
-
-
-class _Place(_Line):
-    joint: str
-    came: Literal[-1, 1]
-    at: float
-    warmth: dict[str, tuple[float, float]] = {}
-
-
-class _Pose(_Place):
-    kind: Literal["pose"]
-    counts: Counts
-    told: dict[str, float]
-    position: Row
-    rotation: tuple[Row, Row, Row] | None
-    deviations: Annotated[tuple[Annotated[float, Field(ge=0)] | None, ...], Field(min_length=6, max_length=6)]
-
-    @model_validator(mode="after")
-    def _is_turned(self) -> Self:
-        matrix = np.eye(3) if self.rotation is None else np.array(self.rotation)
-        if np.linalg.det(matrix) < 0 or np.abs(matrix @ matrix.T - np.eye(3)).max() > _ROTATION_OFF:
-            raise ValueError("no rotation")
-        return self
-
-
-class _Angle(_Place):
-    kind: Literal["angle"]
-    counts: Counts
-    target: float
-    angle: float
-    sd: Annotated[float, Field(gt=0)]
-
-
-class _LeftOut(_Place):
-    kind: Literal["left_out"]
-    counts: int | None = None
-    target: float | None = None
-
-    @model_validator(mode="after")
-    def _is_about_a_point(self) -> Self:
-        if self.counts is None and self.target is None:
-            raise ValueError("neither counts nor a target")
-        return self
-
-
-_LINES: TypeAdapter[_Line] = TypeAdapter(Annotated[_Begun | _Pose | _Angle | _LeftOut, Field(discriminator="kind")])
-
-
 class Record:
     """The observations in a folder's journal; what is there is read at once, and written to when needed."""
 
@@ -475,8 +399,10 @@ class Record:
         self._entries: list[Mapping[str, Any]] = []
         if has_journal(folder):
             with KeptJournal(folder) as journal:
-                for number, entry in enumerate(journal.entries(), start=1):
-                    self._entries.append(_checked(self.path, number, entry))
+                self._entries = [{"kind": entry.kind, **entry.content} for entry in journal.entries()]
+        if self._entries and self._entries[0]["kind"] != BEGUN:
+            text = "its first entry does not say by which tables it was begun."
+            raise DataError(text, where=Location(str(self.path)), hint="Give another --out.")
 
     def __enter__(self) -> Self:
         return self
@@ -515,24 +441,6 @@ class Record:
         if self._journal is not None:
             self._journal.close()
         self._journal = None
-
-
-def _checked(path: Path, number: int, entry: Entry) -> Mapping[str, Any]:
-    damage, content = "", {"kind": entry.kind, **(entry.content if isinstance(entry.content, dict) else {})}
-    try:
-        is_beginning = isinstance(_LINES.validate_json(json.dumps(content)), _Begun)
-    except ValidationError:
-        damage = "an entry that is no observation, or a damaged one"
-    else:
-        if number == 1 and not is_beginning:
-            damage = "a first entry that does not say by which tables it was begun"
-        elif number > 1 and is_beginning:
-            damage = "a second beginning"
-    if damage:
-        remove = f'sqlite3 {path} "delete from entry where sequence = {entry.sequence}"'
-        hint = "Give another --out." if number == 1 else f"Give another --out, or remove it: {remove}"
-        raise DataError(f"entry {entry.sequence}: found {damage}.", where=Location(str(path)), hint=hint)
-    return content
 
 
 class SweepLog(Log):

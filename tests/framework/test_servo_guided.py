@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal.errors import DataError, InputError
+from armcal.errors import InputError
 from armcal_bench.keys import QUIT, SERVO_KEYS, OperatorInput, operator_input
 from armcal_bench.servo_outputs import improved
 from armcal_bench.servo_session import evaluated, measure
@@ -219,14 +219,6 @@ def test_back_asks_again_and_the_later_answer_counts(tmp_path, monkeypatch):
     (first, again) = observed(tmp_path / "out")
     assert first[:3] == again[:3] and again[3] - first[3] == 4
     assert evaluated(setup, tmp_path / "out").servos["q1"].used == 1
-
-
-def test_an_entry_that_is_no_observation_is_refused_with_its_place(tmp_path):
-    with Record(tmp_path) as record:
-        record.append("begun", {"servos": {"q1": STATED}, "base": {"q1": 0.0}})
-        record.append("what", {})
-    with pytest.raises(DataError, match=r"journal.sqlite: entry 2: .*delete from entry where sequence = 2"):
-        Record(tmp_path)
 
 
 def test_observations_of_an_earlier_version_are_named(tmp_path):
