@@ -17,7 +17,8 @@ import numpy as np
 from armcal.io.journal import JOURNAL, Journal
 from armcal.run.experiment import Experiment
 from armcal_bench.servo_session import evaluated, measure
-from armcal_bench.servo_setup import Conversation, Record, Setup
+from armcal_bench.servo_setup import Record, Setup
+from armcal_bench.session import Conversation
 
 from tests.bench_runs import BenchRun, _in_child, _wait, free_port, overrides_for
 from tests.servo_fakes import CONFIGS

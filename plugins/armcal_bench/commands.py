@@ -40,11 +40,11 @@ from armcal_bench.keys import QUIT, RECORDING_KEYS, SERVO_KEYS, OperatorInput, o
 from armcal_bench.postures import IMAGES
 from armcal_bench.preparation import LeaveOut, Prepared, Rest, ScheduleForecast, forecast_schedule, prepare
 from armcal_bench.recorder import KEYS, LOOK, Message, record
-from armcal_bench.run_log import BENCH, DATASET, Progress, Start
+from armcal_bench.run_log import BENCH, DATASET, Start
 from armcal_bench.servo_outputs import improved, results, write_results, write_servo_file
 from armcal_bench.servo_session import evaluated, measure, park, tried
-from armcal_bench.servo_setup import Conversation, Record, Setup
-from armcal_bench.session import Outcome, RunOptions, acquire
+from armcal_bench.servo_setup import Record, Setup
+from armcal_bench.session import Conversation, Outcome, acquire
 from armcal_bench.tracker_monitor import StopRequested, Waits, duration
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -140,18 +140,24 @@ def ask(motion: FirstMotion) -> bool:
     return click.confirm("Is everybody clear of the arm?", err=True)
 
 
-def warned(console: Console, question: Question) -> Question:
+@contextmanager
+def _talking(console: Console, question: Question) -> Iterator[Conversation]:
+    """Lines about what is waited for go to standard error: a progress bar alone does not say that."""
+
     def warn_and_ask(motion: FirstMotion) -> bool:
-        for hazard in motion.hazards:
+        for hazard in motion.hazards:  # whoever gave --yes reads them too
             console.warn(hazard.sentence)
         return question(motion)
 
-    return warn_and_ask
-
-
-def waits(console: Console) -> Waits:
-    """Lines about what is waited for, on standard error: a progress bar alone does not say that."""
-    return Waits(lambda text: console.err.print(text, soft_wrap=True))
+    with Signals() as signals, console.progress() as show:
+        yield Conversation(
+            asked_to_stop=lambda: signals.finish,
+            may_energise=warn_and_ask,
+            report=lambda progress, total: show("measuring", (len(progress.measured) + len(progress.left_out)) / total),
+            say=partial(say, err=console.json),
+            operator=lambda: operator_input(0, SERVO_KEYS, QUIT),
+            waits=Waits(lambda text: console.err.print(text, soft_wrap=True)),
+        )
 
 
 def energise_option(command: F) -> F:
@@ -270,21 +276,8 @@ def _driven(
 ) -> Outcome:
     if not console.json:
         _show_forecast(console, prepared, _forecast(prepared))
-    with Signals() as signals, console.progress() as show:
-
-        def on_progress(progress: Progress) -> None:
-            show("measuring", (len(progress.measured) + len(progress.left_out)) / len(prepared.plan))
-
-        options = RunOptions(
-            out,
-            "resume" if resume else "anew",
-            lambda: signals.finish,
-            warned(console, question),
-            on_progress,
-            unchecked,
-            waits(console),
-        )
-        return acquire(prepared, plan, options)
+    with _talking(console, question) as talk:
+        return acquire(prepared, plan, out, "resume" if resume else "anew", talk, unchecked=unchecked)
 
 
 def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
@@ -420,33 +413,21 @@ def servo(
     experiment = load(console, config, overrides)
     is_bus = check and not guided and servo_file_of(experiment.source) is None
     setup = None if is_bus else Setup.of(experiment)
-    with Signals() as signals, console.progress() as show:
-        talk = Conversation(
-            asked_to_stop=lambda: signals.finish,
-            may_energise=warned(console, may_energise),
-            report=lambda joint, done, planned: show(f"measuring {joint}", done / max(planned, 1)),
-            say=partial(say, err=console.json),
-            operator=lambda: operator_input(0, SERVO_KEYS, QUIT),
-            waits=waits(console),
-        )
+    with _talking(console, may_energise) as talk, _stoppable(console):
         if setup is None:
-            with _stoppable(console):
-                result = check_joints(experiment, talk)
+            result = check_joints(experiment, talk)
             _show_verdicts(console, result.verdicts, [], result.far_zeros, result.notes)
         elif check:
-            with _stoppable(console):
-                verdicts = tried(setup, talk, "somebody" if guided else "tracker")
+            verdicts = tried(setup, talk, "somebody" if guided else "tracker")
             _show_verdicts(console, verdicts, swapped(verdicts))
         elif not parks and not (release and out is None):
             if out is None:
                 raise InputError("found no --out.", hint="Say where what is measured is to be kept, or give --check.")
             if not evaluate:
-                with _stoppable(console):
-                    measure(setup, out, talk, "guided" if guided else "automatic")
+                measure(setup, out, talk, "guided" if guided else "automatic")
             _evaluate(console, setup, out, keep)
         if setup is not None and (parks or release):
-            with _stoppable(console):
-                park(setup, talk, "release" if release else "hold")
+            park(setup, talk, "release" if release else "hold")
 
 
 def _evaluate(console: Console, setup: Setup, out: Path, keep: bool) -> None:

@@ -29,8 +29,8 @@ from armcal_bench.drive import PathPlanner
 from armcal_bench.evidence import FEWEST, Evidence, FrameMistake
 from armcal_bench.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
 from armcal_bench.run_log import Log, Progress, measured_by
-from armcal_bench.servo_setup import ANYWHERE, BEGUN, POSE, Conversation
-from armcal_bench.session import Ending, opened, ready_run
+from armcal_bench.servo_setup import ANYWHERE, BEGUN, POSE
+from armcal_bench.session import Conversation, Ending, drive_poses, known_poses
 from armcal_bench.tracked_body import (
     BODY,
     TABLES,
@@ -364,11 +364,10 @@ def between(poses: Mapping[str, Mapping[str, float]]) -> dict[str, Mapping[str, 
 
 def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conversation, clock: Clock) -> Turned:
     """Drive the poses of ``between`` as a measuring run; ``turns`` are those of the joints (rad)."""
-    log, options, ids = Log(), talk.options(), prepared.scheduler.ids
+    log, ids = Log(), prepared.scheduler.ids
     evidence = Evidence(prepared.arrival, lambda mistake: mistake.frame.is_mirrored, 2 * FEWEST)
-    with opened(prepared, options, clock, lambda identity: None) as (gate, identity):
-        run = ready_run(prepared, options, log, gate, identity, evidence)
-        ending, seen = run.run(), run.known
+    ending, identity = drive_poses(prepared, talk, log, clock, evidence)
+    seen = known_poses(ids, log.progress)
     if ending.how == "refused":
         raise InputError(f"{ending.sentence}.", hint="Correct that, and check again.")
     check_ended(ending, log.progress, len(ids))

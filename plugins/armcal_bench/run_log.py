@@ -122,6 +122,10 @@ class RunLog(Log):
         self.identity = DeviceIdentity(started[-1]["name"], started[0]["device"]) if started else None
         self._failed = False
 
+    def begin(self, identity: DeviceIdentity, at: float) -> None:
+        self.record(STARTED, {"at": at, "device": identity.digest, "name": identity.name})
+        self.identity = identity
+
     @override
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
         self._write(self._journal.record, kind, content)

@@ -20,12 +20,11 @@ from armcal_bench.evidence import Evidence, FrameMistake
 from armcal_bench.hazards import COOLED_TO
 from armcal_bench.joint_check import BASE, Verdict, answered, between, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
-from armcal_bench.run_log import Log, Progress
+from armcal_bench.run_log import Log
 from armcal_bench.servo_fit import Outcome, outcome_of
 from armcal_bench.servo_setup import (
     ANGLE,
     LEFT_OUT,
-    Conversation,
     PulsedJoints,
     Record,
     ServoDevice,
@@ -36,7 +35,7 @@ from armcal_bench.servo_setup import (
     pose_name,
     stated_by,
 )
-from armcal_bench.session import opened, ready_run
+from armcal_bench.session import Conversation, drive_poses
 from armcal_bench.tracker_monitor import MotionGate, StopRequested
 
 _FAR_GAIN = 8.0
@@ -91,18 +90,11 @@ def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int
 def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record) -> None:
     device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
     poses: dict[str, tuple[dict[str, float], dict[str, int]]] = {}
-    planned: dict[str, list[str]] = {joint: [] for joint in setup.joints}
     for joint in setup.joints:
         for counts, came in sweep(setup, device, joint):
             name, side = pose_name(joint, counts, came), came if device.rises(joint) else -came
             poses[name] = {joint: device.angle(joint, counts)}, {joint: side}
-            planned[joint].append(name)
     log, first = SweepLog(record), len(record.entries)
-
-    def report(progress: Progress) -> None:
-        over = {*progress.measured, *progress.left_out}
-        joint = next((joint for joint, names in planned.items() if not over.issuperset(names)), setup.joints[-1])
-        talk.report(joint, len(over.intersection(planned[joint])), len(planned[joint]))
 
     def is_tolerated(mistake: FrameMistake) -> bool:
         """A left-handed frame cannot be distinguished from reversed servos, one by one."""
@@ -121,12 +113,9 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         with closing(device):
             check(open_device(device, clock))
         return
-    prepared, options = setup.run(device, poses), talk.options(report)
-    with opened(prepared, options, clock, check) as (gate, identity):
-        evidence = Evidence(prepared.arrival, is_tolerated, restless_ends=True)
-        run = ready_run(prepared, options, log, gate, identity, evidence)
-        begin(setup, record, identity)
-        ending = run.run()
+    prepared = setup.run(device, poses)
+    evidence = Evidence(prepared.arrival, is_tolerated, restless_ends=True)
+    ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, lambda one, at: begin(setup, record, one))
     if ending.how == "refused":
         hint = "Correct that. Then give another --out."
         if first <= 1:

@@ -1,9 +1,8 @@
 """What a servo calibration is about: the servos of a file, the arm that they move, and where it may go."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, Self
@@ -37,14 +36,11 @@ from typing_extensions import override
 
 from armcal_bench.bench import SECTION, AcquisitionSettings, ArrivalSettings, Bench
 from armcal_bench.drive import PathPlanner
-from armcal_bench.hazards import FirstMotion, HazardJudge, HeatModel
-from armcal_bench.keys import OperatorInput
+from armcal_bench.hazards import HazardJudge, HeatModel
 from armcal_bench.preparation import Prepared, clearance_of, heat_of, of_poses, run_limits
 from armcal_bench.run_log import LEFT_OUT as PASSED
 from armcal_bench.run_log import MEASURED, Log, Progress
-from armcal_bench.session import RunOptions
 from armcal_bench.tracked_body import RigidArm
-from armcal_bench.tracker_monitor import Waits
 
 PositiveAngle = Annotated[Angle, Field(gt=0)]
 PositiveDuration = Annotated[Duration, Field(gt=0)]
@@ -84,23 +80,6 @@ class ServoCalibrationSettings(Settings):
             if not low < high:
                 raise ValueError(f"the range of {joint} does not rise: give [lowest, highest]")
         return self
-
-
-ReportProgress = Callable[[str, int, int], None]  # Takes the joint, and how many of its points are done and planned
-
-
-@dataclass(frozen=True)
-class Conversation:
-    asked_to_stop: Callable[[], bool]  # whether somebody wants it to hold and end
-    may_energise: Callable[[FirstMotion], bool]  # called once before anything moves, with what is dangerous in it
-    report: ReportProgress  # takes how far a tracked calibration is
-    say: Callable[[str], None]  # takes a line, of a guided one
-    operator: Callable[[], AbstractContextManager[OperatorInput]]  # what somebody types, while it is asked for
-    waits: Waits = field(default_factory=Waits)  # says what is waited for
-
-    def options(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> RunOptions:
-        stop, may = self.asked_to_stop, self.may_energise
-        return RunOptions(Path(), "anew", stop, may, on_progress, unchecked=True, when_stopped="hold", waits=self.waits)
 
 
 @dataclass(frozen=True)

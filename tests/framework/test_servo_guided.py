@@ -14,7 +14,8 @@ from armcal.errors import InputError
 from armcal_bench.keys import QUIT, SERVO_KEYS, OperatorInput, operator_input
 from armcal_bench.servo_outputs import improved
 from armcal_bench.servo_session import evaluated, measure
-from armcal_bench.servo_setup import Conversation, Record
+from armcal_bench.servo_setup import Record
+from armcal_bench.session import Conversation
 from armcal_bench.tracker_monitor import StopRequested
 
 from tests.servo_fakes import config_in, setup_on

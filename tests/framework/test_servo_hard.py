@@ -17,7 +17,8 @@ from armcal_bench.drive import Drive
 from armcal_bench.hazards import HeatModel, ThermalState
 from armcal_bench.servo_outputs import improved, write_servo_file
 from armcal_bench.servo_session import evaluated, measure
-from armcal_bench.servo_setup import Conversation, Record
+from armcal_bench.servo_setup import Record
+from armcal_bench.session import Conversation
 from armcal_bench.tracker_monitor import StopRequested
 
 from tests.bench_fakes import FakeClock
