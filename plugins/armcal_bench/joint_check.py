@@ -200,11 +200,13 @@ def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
                         yield _Wiring(moves, {joint: -1 if joint in turned else 1 for joint in joints})
 
 
-def answered(joint: str, commanded: float, ask: Callable[[str], str]) -> Verdict:
-    size = f"{math.degrees(commanded):+.0f} deg"
-    answer = ask(
-        f"{joint} was commanded to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
-    )
+QUESTION = (
+    "{joint} was commanded to turn by {degrees:+.0f} deg. y: it did, r: the other way, o: another joint did, "
+    "n: nothing moved"
+)
+
+
+def answered(joint: str, commanded: float, answer: str) -> Verdict:
     kinds = {"y": ("right", commanded), "r": ("reversed", -commanded), "o": ("another", math.nan), "n": ("still", 0.0)}
     kind, turned = kinds.get(answer, ("unclear", math.nan))
     return _verdict(kind, joint, commanded, turned, "another joint" if kind == "another" else "")
@@ -263,11 +265,9 @@ def _verdict(kind: str, joint: str, commanded: float, turned: float, other: str 
 
 
 _TURNS_DEG = (12.0, -12.0, 6.0, -6.0)
-BASE = "base"
 IN_BASE = "the arm is commanded to hold its base pose"
 _MODEL_SD_M, _ZERO_SD, _TARGET_SD_M = 0.004, math.radians(15.0), 0.01
 """Of the pose of an arm that sags and is not as drawn; of its zeros; of where the tracker's body sits."""
-"""Of the splines of hobby and bus servos."""
 _REST_DEG, _MOST_TEETH = 5.0, 12
 """The standard deviation of a zero that was set by hand; a horn is a tooth off in one case of ten, two in a hundred."""
 _UNREMARKABLE_DEG, _PLAUSIBLE = 10.0, 0.05
@@ -356,27 +356,30 @@ class Turned:
         raise InputError(f"{self.mistake.sentence}.", hint=hint)
 
 
-def between(poses: Mapping[str, Mapping[str, float]]) -> dict[str, Mapping[str, float]]:
-    """Poses by joint, each after the one from which that joint turns."""
-    pairs = [((f"{BASE} {joint}", dict[str, float]()), (joint, turned)) for joint, turned in poses.items()]
-    return {name: pose for pair in pairs for name, pose in pair}
-
-
-def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conversation, clock: Clock) -> Turned:
-    """Drive the poses of ``between`` as a measuring run; ``turns`` are those of the joints (rad)."""
-    log, ids = Log(), prepared.scheduler.ids
+def turned_a_little(
+    prepare: Callable[[Mapping[str, Mapping[str, float]]], Prepared],
+    base: Mapping[str, float],
+    turns: Mapping[str, float],
+    talk: Conversation,
+    clock: Clock,
+) -> Turned:
+    """Turn joints one by one from the base pose, as a measuring run that is prepared for the poses by their ids."""
+    poses: dict[str, dict[str, float]] = {}
+    for joint, turn in turns.items():
+        poses |= {f"base {joint}": {}, joint: {joint: base[joint] + turn}}
+    prepared, log, ids = prepare(poses), Log(), tuple(poses)
     evidence = Evidence(prepared.arrival, lambda mistake: mistake.frame.is_mirrored, 2 * FEWEST)
     ending, identity = drive_poses(prepared, talk, log, clock, evidence)
-    seen = known_poses(ids, log.progress)
     if ending.how == "refused":
         raise InputError(f"{ending.sentence}.", hint="Correct that, and check again.")
     check_ended(ending, log.progress, len(ids))
+    seen = known_poses(ids, log.progress)
     measured = {ids[place]: pose for place, pose in seen.items()}
     moves, unseen = [], []
     for joint, turn in turns.items():
-        missing = next((name for name in (f"{BASE} {joint}", joint) if name not in measured), None)
+        missing = next((name for name in (f"base {joint}", joint) if name not in measured), None)
         if missing is None:
-            moves.append(Move(joint, turn, measured[f"{BASE} {joint}"], measured[joint]))
+            moves.append(Move(joint, turn, measured[f"base {joint}"], measured[joint]))
         else:
             why = log.progress.left_out.get(missing, "it was not measured")
             unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
@@ -421,65 +424,52 @@ def check_joints(experiment: Experiment, talk: Conversation) -> JointCheck:
                 if planner.within(turned) and planner.clear(base, turned):
                     turns[joint] = turn
                     break
-        steps = between({joint: {joint: park[joint] + turn} for joint, turn in turns.items()})
-        angles = np.array([[{**park, **pose}[joint] for joint in joints] for pose in steps.values()])
-        plan = Dataset(tuple(steps), {})
-        prepared = of_poses(bench, own, device, plan, angles, np.zeros_like(angles), limits, base)
-        turned_ones = turned_a_little(prepared, turns, talk, clock)
+        commanded: dict[str, Array] = {}
+
+        def prepare(poses: Mapping[str, Mapping[str, float]]) -> Prepared:
+            for name, pose in poses.items():
+                commanded[name] = np.array([{**park, **pose}[joint] for joint in joints])
+            angles, plan = np.array(list(commanded.values())), Dataset(tuple(poses), {})
+            return of_poses(bench, own, device, plan, angles, np.zeros_like(angles), limits, base)
+
+        turned_ones = turned_a_little(prepare, park, turns, talk, clock)
         at = clock.wall()
-    check = _judged(experiment, arm, park, dict(zip(steps, angles, strict=True)), turned_ones, nominal)
-    far = {joint for joint, zero in check.zeros.items() if zero.is_far}
-    counted = [replace(v, kind="unclear") if v.joint in far else v for v in check.verdicts]
-    seen = {"adapter": turned_ones.identity.adapter, "by": "tracker", "at": at}
-    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
-    return check
-
-
-def _judged(
-    experiment: Experiment,
-    arm: Arm,
-    base: Mapping[str, float],
-    commanded: Mapping[str, Array],
-    turned: Turned,
-    nominal: RigidArm,
-) -> JointCheck:
-    joints = list(base)
-    verdicts = turned.judged(base, nominal)
-    zeros: dict[str, Zero] = {}
-    if len(turned.moves) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
-        names = list(turned.measured)
-        poses = np.array([commanded[name] for name in names]), np.array([turned.measured[name] for name in names])
-        scope, stated = measured_by(experiment)[0], experiment.parameters
-        axes = [f"{scope}.target_{axis}" for axis in "xyz"]
-        target = np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in axes])
-        zeros = _zeros(experiment, arm, joints, poses, target)
+    verdicts, zeros = turned_ones.judged(park, nominal), dict[str, Zero]()
+    if len(turned_ones.moves) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
+        zeros = _zeros(experiment, arm, commanded, turned_ones.measured)
         # a zero that is far off turns the axes of the joints after it away from the model's
-        verdicts = turned.judged({joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
+        verdicts = turned_ones.judged({joint: park[joint] + zeros[joint].value for joint in joints}, nominal)
     verdicts = [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
-    named = {verdict.joint for verdict in verdicts}
     for joint in joints:
-        if joint not in named:
+        if joint not in turns:
             sentence = f"{joint} was not measured: there is nowhere to turn to."
             verdicts.append(Verdict(joint, "unclear", sentence, "Begin from a pose with more room about it."))
-    return JointCheck(verdicts, zeros if all(verdict.kind == "right" for verdict in verdicts) else {})
+    if any(verdict.kind != "right" for verdict in verdicts):
+        zeros = {}
+    counted = [replace(v, kind="unclear") if v.joint in zeros and zeros[v.joint].is_far else v for v in verdicts]
+    seen = {"adapter": turned_ones.identity.adapter, "by": "tracker", "at": at}
+    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
+    return JointCheck(verdicts, zeros)
 
 
 def _zeros(
-    experiment: Experiment, arm: Arm, joints: list[str], poses: tuple[Array, Array], target: Array
+    experiment: Experiment, arm: Arm, commanded: Mapping[str, Array], measured: Mapping[str, Array]
 ) -> dict[str, Zero]:
-    """How much the joints' angles (commanded N x joints, rad; measured N x 4 x 4) are to be enlarged by."""
-    commanded, measured = poses
-    numbers = {joint: arm.joint_names.index(joint) + 1 for joint in joints}
-    names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers.values()]
+    """How much the joints' angles (rad, by pose, in the arm's order) are to be enlarged by."""
+    scope, stated = measured_by(experiment)[0], experiment.parameters
+    axes = [f"{scope}.target_{axis}" for axis in "xyz"]
+    target = tuple(float(stated[name].nominal[0]) if name in stated.names else 0.0 for name in axes)
+    poses, count = np.array(list(measured.values())), len(measured)
+    angles = dict(zip(arm.commanded, np.array([commanded[name] for name in measured]).T, strict=True))
+    numbers = [arm.joint_names.index(joint) + 1 for joint in arm.commanded]
+    names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers]
     places = [f"{BODY}.seat_{axis}" for axis in "xyz"]
     free = {**dict.fromkeys(names, _ZERO_SD), **dict.fromkeys(places, _TARGET_SD_M)}
-    by: By = "position" if np.isnan(measured[:, :3, :3]).any() else "pose"
-    count = len(measured)
-    angles = dict(zip(joints, commanded.T, strict=True))
+    by: By = "position" if np.isnan(poses[:, :3, :3]).any() else "pose"
     noise = np.full(count, _MODEL_SD_M / _LEVER_M), np.full(count, _MODEL_SD_M)
-    seen = body_dataset(arm.name, angles, measured, noise)
-    body = Body((arm.name,), by, NO_TURN, tuple(target.tolist()))
-    fit = BodyFit(experiment, arm, Corrections({}, list(numbers.values()), ()), body, free, seen)
+    seen = body_dataset(arm.name, angles, poses, noise)
+    body = Body((arm.name,), by, NO_TURN, target)
+    fit = BodyFit(experiment, arm, Corrections({}, numbers, ()), body, free, seen)
     fit.fit(seen, np.ones(count))
     sds = fit.deviations(names).tolist()
-    return {joint: Zero(fit.value(name), sd) for joint, name, sd in zip(joints, names, sds, strict=True)}
+    return {joint: Zero(fit.value(name), sd) for joint, name, sd in zip(arm.commanded, names, sds, strict=True)}

@@ -1,14 +1,12 @@
 """A servo calibration from opening the devices to what it leaves behind: tracked, guided, or a check of the wiring."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
-from armcal.arm.servo import PulseClock, PulseTable
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, open_device, state_of
 from armcal.devices.wiring import WiringRecord
@@ -18,7 +16,7 @@ from armcal_bench.bench import closing
 from armcal_bench.drive import Drive
 from armcal_bench.evidence import Evidence, FrameMistake
 from armcal_bench.hazards import COOLED_TO
-from armcal_bench.joint_check import BASE, Verdict, answered, between, check_ended, noted, turned_a_little
+from armcal_bench.joint_check import QUESTION, Verdict, answered, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
 from armcal_bench.run_log import Log
 from armcal_bench.servo_fit import Outcome, outcome_of
@@ -27,9 +25,9 @@ from armcal_bench.servo_setup import (
     LEFT_OUT,
     PulsedJoints,
     Record,
-    ServoDevice,
     Setup,
     SweepLog,
+    Tables,
     begin,
     check_same,
     pose_name,
@@ -43,13 +41,11 @@ _FAR_GAIN = 8.0
 _LOOK_S = 0.1
 _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to its base pose"
 
-Tables = Mapping[str, tuple[PulseTable, PulseClock]]
-
 
 def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
     """Measure all that the record in a folder does not hold yet: ``automatic`` by the tracker, or ``guided``."""
     with Record(folder) as record, setup.bench.clock() as clock:
-        tables = {joint: setup.table_of(joint) for joint in setup.base}
+        tables = dict(setup.tables)
         if record.begun is not None:
             stated, _ = stated_by(setup, record.begun, tuple(setup.base))
             tables = {servo.joint: (servo.table, tables[servo.joint][1]) for servo in stated}
@@ -57,7 +53,7 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
             targets = targets_of(setup)
             if done_in(record).issuperset(target.key for target in targets):
                 return
-            with _directed(setup, clock, talk, tables, record) as arm, talk.operator() as operator:
+            with _directed(setup, clock, talk, record, tables) as arm, talk.operator() as operator:
                 Guided(setup, arm, operator, record, talk.say).run(targets)
         else:
             _tracked(setup, clock, talk, tables, record)
@@ -88,12 +84,13 @@ def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int
 
 
 def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record) -> None:
-    device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
-    poses: dict[str, tuple[dict[str, float], dict[str, int]]] = {}
+    device = PulsedJoints(setup, tables)
+    poses, sides = dict[str, dict[str, float]](), dict[str, dict[str, int]]()
     for joint in setup.joints:
         for counts, came in sweep(setup, device, joint):
-            name, side = pose_name(joint, counts, came), came if device.rises(joint) else -came
-            poses[name] = {joint: device.angle(joint, counts)}, {joint: side}
+            name = pose_name(joint, counts, came)
+            poses[name] = {joint: device.angle(joint, counts)}
+            sides[name] = {joint: came if device.rises(joint) else -came}
     log, first = SweepLog(record), len(record.entries)
 
     def is_tolerated(mistake: FrameMistake) -> bool:
@@ -113,7 +110,7 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         with closing(device):
             check(open_device(device, clock))
         return
-    prepared = setup.run(device, poses)
+    prepared = setup.run(device, poses, sides)
     evidence = Evidence(prepared.arrival, is_tolerated, restless_ends=True)
     ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, lambda one, at: begin(setup, record, one))
     if ending.how == "refused":
@@ -127,11 +124,17 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
 
 @contextmanager
 def _directed(
-    setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record | None = None, releases: bool = False
+    setup: Setup,
+    clock: Clock,
+    talk: Conversation,
+    record: Record | None = None,
+    tables: Tables | None = None,
+    *,
+    releases: bool = False,
 ) -> Iterator["Directed"]:
     """An arm that somebody moves joint by joint, in its base pose; it holds when it is stopped."""
-    device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
-    prepared, settings = setup.run(device, {BASE: ({}, {})}), setup.acquisition
+    device = PulsedJoints(setup, tables)
+    prepared, settings = setup.run(device, {"base": {}}), setup.acquisition
     gate = MotionGate(None, clock, settings.lost, talk.asked_to_stop, talk.waits)
     with closing(device):
         identity = open_device(device, clock)
@@ -298,49 +301,31 @@ def done_in(record: Record) -> set[tuple[str, int, int]]:
 def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
     """Move each joint a little, judge by ``tracker`` or ``somebody`` what it did, and note which are checked."""
     record = WiringRecord.of_servo_file(setup.path, setup.file)
-    tables = {joint: setup.table_of(joint) for joint in setup.base}
-    turns = {joint: _small_turn(setup, joint) for joint in setup.joints}
+    turns: dict[str, float] = {}
+    for joint in setup.joints:
+        (low, high), at, size = setup.ranges[joint], setup.base[joint], setup.settings.check
+        turns[joint] = size if high - at >= size or high - at >= at - low else -size  # to where it has room
     with setup.bench.clock() as clock:
         if seen == "tracker":
-            device = PulsedJoints(setup, cast(ServoDevice, setup.bench.device()), tables)
-            turned = {joint: {joint: setup.base[joint] + turn} for joint, turn in turns.items()}
-            prepared = setup.run(device, {name: (pose, {}) for name, pose in between(turned).items()})
-            seen_turns = turned_a_little(prepared, turns, talk, clock)
-            identity, verdicts = seen_turns.identity, seen_turns.judged(setup.base, setup.nominal)
+            device = PulsedJoints(setup)
+            turned = turned_a_little(lambda poses: setup.run(device, poses), setup.base, turns, talk, clock)
+            identity, verdicts = turned.identity, turned.judged(setup.base, setup.nominal)
         else:
-            with _directed(setup, clock, talk, tables) as arm, talk.operator() as operator:
-                verdicts = [_by_eye(setup, arm, joint, turn, talk, operator) for joint, turn in turns.items()]
-            identity = arm.identity
+            with _directed(setup, clock, talk) as arm, talk.operator() as operator:
+                identity, verdicts = arm.identity, []
+                for joint, turn in turns.items():
+                    counts = arm.counts(joint)
+                    arm.go(joint, arm.device.counts(joint, setup.base[joint] + turn))
+                    talk.say(QUESTION.format(joint=joint, degrees=math.degrees(turn)))
+                    verdicts.append(answered(joint, turn, arm.next_word(operator)))
+                    arm.go(joint, counts)
         noted(record, verdicts, {"adapter": identity.adapter, "by": seen, "at": clock.wall()})
     return verdicts
 
 
-def _by_eye(
-    setup: Setup, arm: Directed, joint: str, turn: float, talk: Conversation, operator: OperatorInput
-) -> Verdict:
-    at = arm.counts(joint)
-    arm.go(joint, arm.device.counts(joint, setup.base[joint] + turn))
-
-    def ask(question: str) -> str:
-        talk.say(question)
-        return arm.next_word(operator)
-
-    verdict = answered(joint, turn, ask)
-    arm.go(joint, at)
-    return verdict
-
-
-def _small_turn(setup: Setup, joint: str) -> float:
-    """Away from the base pose (rad), to the side where the joint's range has room for it."""
-    low, high = setup.ranges[joint]
-    at, size = setup.base[joint], setup.settings.check
-    return size if high - at >= size or high - at >= at - low else -size
-
-
 def park(setup: Setup, talk: Conversation, how: str) -> None:
     """Bring the servos to the base pose, and with ``release`` end their pulses, the tip's first."""
-    tables = {joint: setup.table_of(joint) for joint in setup.base}
-    with setup.bench.clock() as clock, _directed(setup, clock, talk, tables, releases=how == "release") as arm:
+    with setup.bench.clock() as clock, _directed(setup, clock, talk, releases=how == "release") as arm:
         arm.drive.hold()
         if how == "release":
             arm.drive.release()

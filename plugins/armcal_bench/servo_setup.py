@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
@@ -21,7 +22,6 @@ from armcal.devices.device import (
     DeviceRefusedError,
     DeviceState,
     JointDevice,
-    PulseDevice,
     open_device,
     state_of,
 )
@@ -102,6 +102,7 @@ def piecewise(at: Array, values: Array) -> BSpline:
     return make_interp_spline(at, values, k=1)
 
 
+Tables = Mapping[str, tuple[PulseTable, PulseClock]]  # By joint, with its board's clock
 AT = (SECTION, "servo")
 _LOOK_STEP = math.radians(2.0)
 ANYWHERE = ArrivalSettings.si(astray=100.0, astray_turned=2 * math.pi)
@@ -140,7 +141,14 @@ class Setup:
         file = load_servo_file(path)
         arm = bench.arm
         moved = tuple(joint for joint in arm.commanded if joint in file.servos)
-        _check_names(experiment, settings, file, moved)
+        for key in ("joints", "base", "ranges"):
+            if fault := unknown_joint(getattr(settings, key), moved):
+                where = experiment.source.where((*AT, key))
+                raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
+        if not moved:
+            text = "the servo file has no servo of a joint of this arm."
+            hint = f"Name them as the joints: {', '.join(file.servos)} are not in the model."
+            raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
         stated = settings.base or bench.settings.acquisition.park
         base = {joint: stated.get(joint, 0.0) for joint in moved}
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
@@ -162,6 +170,10 @@ class Setup:
     def table_of(self, joint: str) -> tuple[PulseTable, PulseClock]:
         servo = self.file.servos[joint]
         return servo.table, self.file.boards[servo.board].clock
+
+    @property
+    def tables(self) -> Tables:
+        return {joint: self.table_of(joint) for joint in self.base}
 
     def knots_of(self, joint: str) -> tuple[float, ...]:
         """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range."""
@@ -224,49 +236,36 @@ class Setup:
         return self.bench.settings.acquisition.model_copy(update=changes)
 
     def run(
-        self, device: "PulsedJoints", poses: Mapping[str, tuple[Mapping[str, float], Mapping[str, int]]]
+        self,
+        device: "PulsedJoints",
+        poses: Mapping[str, Mapping[str, float]],
+        sides: Mapping[str, Mapping[str, int]] = MappingProxyType({}),
     ) -> Prepared:
         """A run through poses by id: where joints are that are not in the base pose (rad), and from where they come."""
         joints = device.joint_names
-        angles = np.array([[{**self.base, **pose}[joint] for joint in joints] for pose, _ in poses.values()])
-        sides = np.array([[float(side.get(joint, 0)) for joint in joints] for _, side in poses.values()])
+        angles = np.array([[{**self.base, **pose}[joint] for joint in joints] for pose in poses.values()])
+        approaches = np.array([[float(sides.get(name, {}).get(joint, 0)) for joint in joints] for name in poses])
         ends = np.array([self.ranges[joint] for joint in joints])
         standing = device.standing(self.base)
         park = np.array([standing[joint] for joint in joints])
-        return of_poses(self.bench, self.acquisition, device, Dataset(tuple(poses), {}), angles, sides, ends, park)
+        return of_poses(self.bench, self.acquisition, device, Dataset(tuple(poses), {}), angles, approaches, ends, park)
 
     def _pose(self, other: Mapping[str, float]) -> Array:
         return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])
 
 
-def _check_names(
-    experiment: Experiment, settings: ServoCalibrationSettings, file: ServoFile, moved: tuple[str, ...]
-) -> None:
-    for key in ("joints", "base", "ranges"):
-        if fault := unknown_joint(getattr(settings, key), moved):
-            where = experiment.source.where((*AT, key))
-            raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
-    if not moved:
-        text = "the servo file has no servo of a joint of this arm."
-        hint = f"Name them as the joints: {', '.join(file.servos)} are not in the model."
-        raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
-
-
-class ServoDevice(JointDevice, PulseDevice, Protocol):
-    """What a servo calibration needs: joints moved by pulses."""
-
-
 class PulsedJoints(JointDevice):
     """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end."""
 
-    def __init__(self, setup: Setup, device: ServoDevice, tables: Mapping[str, tuple[PulseTable, PulseClock]]) -> None:
-        self._setup, self._device, self._tables = setup, device, tables
+    def __init__(self, setup: Setup, tables: Tables | None = None) -> None:
+        self._setup, self._tables = setup, tables or setup.tables
+        self._device: Any = setup.bench.device()  # a JointDevice and, as ``open`` checks, a PulseDevice
         self._set: dict[str, int] = {}
 
     @property
     @override
     def joint_names(self) -> tuple[str, ...]:
-        return self._device.joint_names
+        return tuple(self._device.joint_names)
 
     @override
     def open(self, clock: Clock) -> DeviceIdentity:
@@ -307,7 +306,7 @@ class PulsedJoints(JointDevice):
     @override
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
         """The device goes no farther than its own tables."""
-        return self._device.guard([self._own(waypoint) for waypoint in waypoints], rate, after_s)
+        return bool(self._device.guard([self._own(waypoint) for waypoint in waypoints], rate, after_s))
 
     @override
     def release(self, joint: str) -> None:
