@@ -81,8 +81,6 @@ def _short(number: float) -> str:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Values, how sure their coordinates are, and the noise found in units of the declared one."""
-
     values: Array
     half: Array  # a root of the covariance by coordinates (n x k)
     scale: float
@@ -295,8 +293,6 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
 
 @dataclass(frozen=True)
 class Assessment:
-    """What the postures determine, which of them disagree, and what would help."""
-
     newest: Offset | None = None  # of the last posture; None where there is nothing to compare it with
     doubts: Mapping[str, Offset] = field(default_factory=dict)  # postures that disagree, by name
     known: Knowledge | None = None  # what is determined; None if that could not be judged
@@ -321,8 +317,6 @@ def contacts_of(experiment: Experiment, camera: LiveCamera | None) -> dict[str, 
 
 
 class Assessor:
-    """Judges postures, and remembers which were in doubt and where the last fit ended."""
-
     def __init__(self, experiment: Experiment, camera: LiveCamera | None) -> None:
         self._experiment, self._contacts = experiment, contacts_of(experiment, camera)
         self._doubtful: Collection[str] = ()

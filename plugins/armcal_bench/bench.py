@@ -263,8 +263,6 @@ def closing(*parts: Any) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Bench:
-    """What an experiment's bench is made of; parts are built when they are asked for, and opened by who uses them."""
-
     experiment: Experiment
     settings: BenchSettings
 
@@ -282,7 +280,6 @@ class Bench:
 
     @cached_property
     def simulation(self) -> RunningBench | None:
-        """The simulated bench that stands in for the parts; None where they are real."""
         if self.settings.simulated is None:
             return None
         simulator: SimulatedBench = self._built("simulator", kind="bench")

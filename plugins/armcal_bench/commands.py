@@ -41,7 +41,7 @@ from armcal_bench.postures import IMAGES
 from armcal_bench.preparation import LeaveOut, Prepared, Rest, ScheduleForecast, forecast_schedule, prepare
 from armcal_bench.recorder import KEYS, LOOK, Message, record
 from armcal_bench.run_log import BENCH, DATASET, Start
-from armcal_bench.servo_outputs import improved, results, write_results, write_servo_file
+from armcal_bench.servo_fit import improved, results, write_results, write_servo_file
 from armcal_bench.servo_session import evaluated, measure, park, tried
 from armcal_bench.servo_setup import Record, Setup
 from armcal_bench.session import Conversation, Outcome, acquire
@@ -357,7 +357,6 @@ def _show_dry_run(console: Console, prepared: Prepared) -> None:
 
 
 def _account(bench: Path) -> dict[str, Any]:
-    """What the simulated bench wrote of its arm; empty where nothing happened there."""
     try:
         account: dict[str, Any] = json.loads((bench / ACCOUNT).read_bytes())
     except FileNotFoundError:
@@ -462,7 +461,6 @@ def _show_verdicts(
     zeros: Sequence[str] = (),
     notes: Sequence[str] = (),
 ) -> None:
-    """What each joint did, ``swapped`` pairs, and zeros that are far off; fails unless all is well but for notes."""
     shown = [{**asdict(v), "turned": v.turned if v.turned == v.turned else None} for v in verdicts]
     console.result({"joints": shown, "swapped": pairs, "far_zeros": zeros, "notes": notes})
     for verdict in verdicts:
@@ -551,7 +549,6 @@ def record_command(
     bench = Bench.of(experiment)
 
     def show(message: Message) -> None:
-        """A JSON line, or a sentence; flushed, so that who reads it knows at once what is safe."""
         if console.json:
             click.echo(
                 json.dumps({**JSON_SCHEMA, "event": message.kind, **message.content, "sentence": message.sentence})
@@ -602,9 +599,7 @@ def _keys(bench: Bench, capture: str) -> Iterator[tuple[OperatorInput, bool]]:
                 hint="Give --capture still, or let the readings come from udp:PORT or a file.",
             )
     try:
-        with operator_input(
-            descriptor, RECORDING_KEYS, echo=lambda text: click.echo(text, err=True, nl=False)
-        ) as operator:
+        with operator_input(descriptor, RECORDING_KEYS) as operator:
             yield operator, descriptor is not None and os.isatty(descriptor)
     finally:
         if opened is not None:

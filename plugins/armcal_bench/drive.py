@@ -164,7 +164,6 @@ class Drive:
         return self._named(self.at)
 
     def take_over(self, angles: Mapping[str, float]) -> None:
-        """Joint angles (rad) that were commanded before, by this run or another."""
         self.at = np.array([angles.get(joint, self.at[i]) for i, joint in enumerate(self.joints)])
 
     def energise(self, known: Mapping[str, float]) -> None:
@@ -196,7 +195,6 @@ class Drive:
         return commanded
 
     def measured(self) -> dict[str, float]:
-        """Where the joints stand (rad), by servos that know; empty for others."""
         return measured_angles(self.device)
 
     def go(self, path: Sequence[Array], may_move: MayMove) -> None:

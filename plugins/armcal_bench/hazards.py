@@ -121,7 +121,6 @@ class ThermalState:
         self.warmth = self.model.after(self.warmth, self.model.torques(self._pose(standing)) * held, max(seconds, 0.0))
 
     def pass_to_now(self, angles: Mapping[str, float]) -> None:
-        """The servos have stood at these angles (rad) since the last call."""
         now = self._clock.now()
         self.warmth = self.model.after(self.warmth, self.model.torques(self._pose(angles)), now - self._since)
         self._since = now
@@ -183,7 +182,6 @@ class FirstMotion:
 @dataclass(frozen=True, eq=False)
 class HazardJudge:
     joints: tuple[str, ...]  # in the arm's order
-    moved: tuple[str, ...]  # those that have servos
     limits: Array  # of the joints (joints x 2, rad)
     torques: Torques  # of the load on each joint (joints, N m); it turns a limp joint the way of its sign
     rest: Array  # where the arm parks, or its base pose (joints, rad)
@@ -197,15 +195,14 @@ class HazardJudge:
         measured: Collection[str] = (),
     ) -> FirstMotion:
         """A run's start and its end; limp joints get the ``first`` angles, or those of the rest pose."""
-        powered = tuple(joint for joint in self.moved if joint in standing)
-        limp = [joint for joint in self.moved if joint not in standing]
+        powered = tuple(joint for joint in self.joints if joint in standing)
+        limp = [joint for joint in self.joints if joint not in standing]
         free = tuple(joint for joint in limp if joint not in measured)
         hazards = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
         there = tuple(hazard for hazard in hazards if hazard is not None)
         return FirstMotion(free, powered, there, tuple(joint for joint in limp if joint in measured))
 
     def _jump(self, free: Sequence[str], first: Mapping[str, float]) -> Hazard | None:
-        """A limp joint hangs anywhere: at an end of its range, or as it falls from where the arm rests."""
         goals = [first.get(joint, float(self.rest[i])) for i, joint in enumerate(self.joints)]
         jumps = [
             max((abs(goals[i] - end), end, i) for end in (*self.limits[i], self._fallen[i]))

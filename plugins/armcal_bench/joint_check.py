@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 
 from armcal_bench.bench import SECTION, Bench, closing
 from armcal_bench.drive import PathPlanner
-from armcal_bench.evidence import FEWEST, Evidence, FrameMistake
 from armcal_bench.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
 from armcal_bench.run_log import Log, Progress, measured_by
 from armcal_bench.servo_setup import ANYWHERE, BEGUN, POSE
@@ -43,7 +42,7 @@ from armcal_bench.tracked_body import (
     turn_of_point,
     twist_angles,
 )
-from armcal_bench.tracker_monitor import StopRequested, pose_of
+from armcal_bench.tracker_monitor import FEWEST, Evidence, FrameMistake, StopRequested, pose_of
 
 _LEVER_M = 0.1
 _STILL = math.radians(1.5)

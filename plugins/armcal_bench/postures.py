@@ -155,8 +155,6 @@ KEPT = "*"  # A part of a name that stays what it was
 
 
 class Labels:
-    """The labels that the next posture gets."""
-
     def __init__(self, measurements: Mapping[str, Measurement], known: Sequence[str]) -> None:
         self._grouped = [m for m in measurements.values() if isinstance(m, GroupedMeasurement)]
         self.columns = tuple(dict.fromkeys(label for m in self._grouped for label in m.group_labels))
@@ -237,8 +235,6 @@ class Posture:
 
 
 class RecordingLog:
-    """An open journal and the postures in it, in order."""
-
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
         self._postures: dict[str, Posture] = {}
@@ -260,7 +256,6 @@ class RecordingLog:
         return Posture(name, dict(mean.angles), mean.spread, mean.readings, at, dict(labels), mean.stamp, values=values)
 
     def capture(self, posture: Posture) -> None:
-        """Write the next posture, which outlasts a power loss then; see ``Journal.record`` for what it raises."""
         self._journal.record(CAPTURED, posture.as_dict())
         self._take(posture)
 

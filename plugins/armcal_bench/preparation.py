@@ -21,8 +21,8 @@ from armcal.run.plan_poses import JointSpace, commands_of, read_poses, stated_be
 
 from armcal_bench.bench import AcquisitionSettings, Bench
 from armcal_bench.drive import JointPath, PathPlanner, travel
-from armcal_bench.evidence import Arrival
 from armcal_bench.hazards import COOLED_TO, NEVER, HazardJudge, HeatModel, holding_torques
+from armcal_bench.tracker_monitor import Arrival
 
 _AT = ("bench", "acquisition")
 _SLACK = 1e-9
@@ -55,8 +55,6 @@ Next = Measure | Rest | LeaveOut
 
 @dataclass(frozen=True)
 class Scheduler:
-    """Decides from where the arm stands, how warm its servos are, and what is left."""
-
     poses: Array  # N x joints, rad
     ids: tuple[str, ...]  # of the poses
     approaches: Array  # from which side each joint is to come (N x joints): 1 from below, -1 from above, 0 either
@@ -97,7 +95,6 @@ class Scheduler:
         return Measure(pose, path, gone + self.capture, np.maximum(there, after))
 
     def _fits(self, step: Measure | LeaveOut) -> bool:
-        """Within the budget there, and on the path to where it rests."""
         if isinstance(step, LeaveOut) or self.model.over(step.thermal_state):
             return False
         back = self.planner.find(step.path[-1], self.park)
@@ -183,7 +180,14 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             poses.append(_nearest_settable(device, pose))  # half a count beyond a limit is the board's affair
         except DeviceRefusedError as fault:
             refuse(row, fault.message, fault.hint, fault)
-    park = _settable_park(experiment, settings, device, limits)
+    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
+    if unknown := unknown_joint(settings.park, joints):
+        raise ConfigError(f"{unknown}.", where=where)
+    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
+    if (outside := _outside(park, limits)).any():
+        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
+        raise ConfigError(text, where=where, hint="Choose another pose.")
+    park = _nearest_settable(device, park)
     # from which side each joint is to come; 0 where the plan does not say
     sides = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
     approaches = np.nan_to_num(np.array(sides).T.reshape(len(commands), -1))
@@ -208,7 +212,6 @@ def of_poses(
     limits: Array,
     park: Array,
 ) -> Prepared:
-    """A run through poses (N x joints, rad) that were found to be allowed, as the device can set them."""
     experiment, arm = bench.experiment, bench.arm
     settable = np.array(
         [
@@ -221,7 +224,7 @@ def of_poses(
     heat = heat_of(experiment, settings, arm)
     rate, capture = float(np.deg2rad(settings.rate_deg_per_s)), settings.settle.wait + settings.settle.window + 0.5
     scheduler = Scheduler(poses, plan.ids, approaches, park, planner, heat, rate, capture)
-    judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
+    judge = HazardJudge(device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
     return Prepared(bench, settings, device, plan, scheduler, arrival, judge, ())
 
@@ -243,21 +246,9 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
     return np.array([ends for ends in limits.values() if ends is not None])
 
 
-def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
-    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
-    if unknown := unknown_joint(settings.park, joints):
-        raise ConfigError(f"{unknown}.", where=where)
-    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
-    if (outside := _outside(park, limits)).any():
-        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
-        raise ConfigError(text, where=where, hint="Choose another pose.")
-    return _nearest_settable(device, park)
-
-
 def check_park(
     experiment: Experiment, planner: PathPlanner, heat: HeatModel, park: Array, joints: tuple[str, ...]
 ) -> None:
-    """Refuse a park pose (joints, rad) that is too near to something, or in which a servo would not cool."""
     where = experiment.source.where((*_AT, "park"))
     if not planner.allowed(park):
         raise ConfigError("the pose where the arm parks is too near to something.", where=where, hint="Choose another.")

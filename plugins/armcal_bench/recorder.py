@@ -50,8 +50,6 @@ _MOST_UNSEEN = 20  # Images without a board, and none with one: something is wro
 
 @dataclass(frozen=True)
 class Message:
-    """One event of a recording."""
-
     kind: str  # ``captured``, ``refused``, ``undone``, ``disagrees``, ``known``, ...
     sentence: str  # for people
     content: Mapping[str, Any] = field(default_factory=dict)  # for programs; JSON
@@ -114,8 +112,6 @@ def _advised(after: Assessment, before: Assessment) -> list[Message]:
 
 
 class Recorder:
-    """Takes readings and commands, and gives back messages about what came of them."""
-
     def __init__(
         self,
         bench: Bench,
@@ -364,7 +360,6 @@ def record(
     asked_to_end: Callable[[], bool],
     show: Callable[[Message], None],
 ) -> Message:
-    """Record until somebody ends it, or the stream ends; how it ended."""
     camera = bench.camera()
     channels = JointKinds.of(bench.experiment.system.arms).channels
     columns = Labels(bench.experiment.system.measurements, ()).columns

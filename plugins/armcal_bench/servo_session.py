@@ -1,10 +1,11 @@
 """A servo calibration from opening the devices to what it leaves behind: tracked, guided, or a check of the wiring."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from armcal.devices.clock import Clock
@@ -14,7 +15,6 @@ from armcal.errors import InputError, Location
 
 from armcal_bench.bench import closing
 from armcal_bench.drive import Drive
-from armcal_bench.evidence import Evidence, FrameMistake
 from armcal_bench.hazards import COOLED_TO
 from armcal_bench.joint_check import QUESTION, Verdict, answered, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
@@ -23,18 +23,18 @@ from armcal_bench.servo_fit import Outcome, outcome_of
 from armcal_bench.servo_setup import (
     ANGLE,
     LEFT_OUT,
+    KnownServo,
     PulsedJoints,
     Record,
     Setup,
     SweepLog,
-    Tables,
     begin,
     check_same,
     pose_name,
     stated_by,
 )
 from armcal_bench.session import Conversation, drive_poses
-from armcal_bench.tracker_monitor import MotionGate, StopRequested
+from armcal_bench.tracker_monitor import Evidence, FrameMistake, MotionGate, StopRequested
 
 _FAR_GAIN = 8.0
 """Of lengths: in sweeps of one joint after the other a reversed servo resembles a frame with a smaller one."""
@@ -45,26 +45,24 @@ _AS_IT_IS = "its pulses go on as they are, unless the board brings the arm to it
 def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
     """Measure all that the record in a folder does not hold yet: ``automatic`` by the tracker, or ``guided``."""
     with Record(folder) as record, setup.bench.clock() as clock:
-        tables = dict(setup.tables)
-        if record.begun is not None:
-            stated, _ = stated_by(setup, record.begun, tuple(setup.base))
-            tables = {servo.joint: (servo.table, tables[servo.joint][1]) for servo in stated}
+        servos = {} if record.begun is None else stated_by(setup, record.begun)
         if how == "guided":
             targets = targets_of(setup)
             if done_in(record).issuperset(target.key for target in targets):
                 return
-            with _directed(setup, clock, talk, record, tables) as arm, talk.operator() as operator:
+            with _directed(setup, clock, talk, record, servos) as arm, talk.operator() as operator:
                 Guided(setup, arm, operator, record, talk.say).run(targets)
         else:
-            _tracked(setup, clock, talk, tables, record)
+            _tracked(setup, clock, talk, servos, record)
 
 
 def evaluated(setup: Setup, folder: Path) -> Outcome:
     record = Record(folder)
     if record.begun is None:
         raise InputError("it holds nothing measured.", where=Location(str(folder)), hint="Measure first.")
-    servos, clocks = stated_by(setup, record.begun, setup.joints)
-    return outcome_of(record.entries, servos, clocks, setup.bench.experiment, setup.bench.arm, setup.settings)
+    stated = stated_by(setup, record.begun)
+    servos = [stated[joint] for joint in setup.joints]
+    return outcome_of(record.entries, servos, setup.bench.experiment, setup.bench.arm, setup.settings)
 
 
 def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int]]:
@@ -83,8 +81,8 @@ def sweep(setup: Setup, device: PulsedJoints, joint: str) -> list[tuple[int, int
     return [(counts, 1) for counts in fits] + [(counts, -1) for counts in reversed(fits)]
 
 
-def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, record: Record) -> None:
-    device = PulsedJoints(setup, tables)
+def _tracked(setup: Setup, clock: Clock, talk: Conversation, servos: Mapping[str, KnownServo], record: Record) -> None:
+    device = PulsedJoints(setup, servos)
     poses, sides = dict[str, dict[str, float]](), dict[str, dict[str, int]]()
     for joint in setup.joints:
         for counts, came in sweep(setup, device, joint):
@@ -97,20 +95,21 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, tables: Tables, rec
         """A left-handed frame cannot be distinguished from reversed servos, one by one."""
         return 1 / _FAR_GAIN < mistake.frame.gain < _FAR_GAIN
 
+    if set(poses) <= set(log.progress.measured):
+        with closing(device):
+            check_same(setup, record, open_device(device, clock))
+        return
+    prepared = setup.run(device, poses, sides)
+
     def check(identity: DeviceIdentity) -> None:
         check_same(setup, record, identity)
-        rest = np.array([setup.base.get(joint, 0.0) for joint in device.joint_names])
-        hot = setup.heat.too_hot_for_ever(setup.heat.torques(rest), COOLED_TO)
+        model = prepared.scheduler.model
+        hot = model.too_hot_for_ever(model.torques(prepared.scheduler.park), COOLED_TO)
         if hot is not None:
             named = f"the servo of {device.joint_names[hot]} would not cool in the base pose, by bench.acquisition.heat"
             hint = "Give bench.servo.base a pose in which it carries less."
             raise InputError(f"{named}; nothing was moved.", hint=hint)
 
-    if set(poses) <= set(log.progress.measured):
-        with closing(device):
-            check(open_device(device, clock))
-        return
-    prepared = setup.run(device, poses, sides)
     evidence = Evidence(prepared.arrival, is_tolerated, restless_ends=True)
     ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, lambda one, at: begin(setup, record, one))
     if ending.how == "refused":
@@ -128,19 +127,19 @@ def _directed(
     clock: Clock,
     talk: Conversation,
     record: Record | None = None,
-    tables: Tables | None = None,
+    servos: Mapping[str, KnownServo] = MappingProxyType({}),
     *,
     releases: bool = False,
 ) -> Iterator["Directed"]:
     """An arm that somebody moves joint by joint, in its base pose; it holds when it is stopped."""
-    device = PulsedJoints(setup, tables)
+    device = PulsedJoints(setup, servos)
     prepared, settings = setup.run(device, {"base": {}}), setup.acquisition
     gate = MotionGate(None, clock, settings.lost, talk.asked_to_stop, talk.waits)
     with closing(device):
         identity = open_device(device, clock)
         if record is not None:
             check_same(setup, record, identity)
-        start = setup.judge.first_motion(state_of(device).angles, {}, releases=releases)
+        start = prepared.judge.first_motion(state_of(device).angles, {}, releases=releases)
         if (start.free or start.hazards) and not talk.may_energise(start):
             raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
         if record is not None:
@@ -165,8 +164,6 @@ def _directed(
 
 @dataclass(frozen=True)
 class Directed:
-    """The joints of an arm, moved one by one by their pulses."""
-
     device: PulsedJoints
     drive: Drive
     gate: MotionGate
@@ -324,7 +321,6 @@ def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
 
 
 def park(setup: Setup, talk: Conversation, how: str) -> None:
-    """Bring the servos to the base pose, and with ``release`` end their pulses, the tip's first."""
     with setup.bench.clock() as clock, _directed(setup, clock, talk, releases=how == "release") as arm:
         arm.drive.hold()
         if how == "release":

@@ -36,8 +36,7 @@ from typing_extensions import override
 
 from armcal_bench.bench import SECTION, AcquisitionSettings, ArrivalSettings, Bench
 from armcal_bench.drive import PathPlanner
-from armcal_bench.hazards import HazardJudge, HeatModel
-from armcal_bench.preparation import Prepared, clearance_of, heat_of, of_poses, run_limits
+from armcal_bench.preparation import Prepared, clearance_of, of_poses, run_limits
 from armcal_bench.run_log import LEFT_OUT as PASSED
 from armcal_bench.run_log import MEASURED, Log, Progress
 from armcal_bench.tracked_body import RigidArm
@@ -87,6 +86,7 @@ class KnownServo:
     joint: str  # that it turns
     board: str  # that drives it
     table: PulseTable  # as stated; pulses by the board's oscillator
+    clock: PulseClock  # of the board
     knots: tuple[float, ...] = ()  # angles (rad) that the table is to be given at; empty: those of the stated one
 
     @property
@@ -102,7 +102,6 @@ def piecewise(at: Array, values: Array) -> BSpline:
     return make_interp_spline(at, values, k=1)
 
 
-Tables = Mapping[str, tuple[PulseTable, PulseClock]]  # By joint, with its board's clock
 AT = (SECTION, "servo")
 _LOOK_STEP = math.radians(2.0)
 ANYWHERE = ArrivalSettings.si(astray=100.0, astray_turned=2 * math.pi)
@@ -110,8 +109,6 @@ ANYWHERE = ArrivalSettings.si(astray=100.0, astray_turned=2 * math.pi)
 
 @dataclass(frozen=True)
 class Setup:
-    """All that is known before anything moves."""
-
     bench: Bench  # the configured one
     settings: ServoCalibrationSettings  # of the calibration
     path: Path  # of the servo file
@@ -120,9 +117,7 @@ class Setup:
     base: Mapping[str, float]  # where every servo's joint stands while others are measured (rad)
     ranges: Mapping[str, tuple[float, float]]  # over which each joint may be moved from there (rad)
     nominal: RigidArm  # the arm by its model
-    heat: HeatModel  # of the servos
     planner: PathPlanner  # of straight ways on which nothing comes too near, if that is stated
-    judge: HazardJudge  # of what is dangerous in the first motions
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
@@ -154,26 +149,14 @@ class Setup:
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
         limits = dict(zip(arm.commanded, run_limits(experiment, acquisition, arm).tolist(), strict=True))
-        nominal = RigidArm(arm, experiment.parameters)
-        heat = heat_of(experiment, bench.settings.acquisition, arm)
-        ends = np.array(list(limits.values()))
+        ends, nominal = np.array(list(limits.values())), RigidArm(arm, experiment.parameters)
         planner = PathPlanner(clearance_of(experiment, arm), ends, np.zeros((0, len(limits))), _LOOK_STEP)
-        rest = np.array([base.get(joint, 0.0) for joint in arm.commanded])
-        judge = HazardJudge(tuple(arm.commanded), moved, ends, heat.torques, rest)
-        setup = cls(bench, settings, path, file, settings.joints or moved, base, {}, nominal, heat, planner, judge)
+        setup = cls(bench, settings, path, file, settings.joints or moved, base, {}, nominal, planner)
         return replace(setup, ranges=setup._clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
         servo = self.file.servos[joint]
-        return KnownServo(joint, servo.board, servo.table, self.knots_of(joint))
-
-    def table_of(self, joint: str) -> tuple[PulseTable, PulseClock]:
-        servo = self.file.servos[joint]
-        return servo.table, self.file.boards[servo.board].clock
-
-    @property
-    def tables(self) -> Tables:
-        return {joint: self.table_of(joint) for joint in self.base}
+        return KnownServo(joint, servo.board, servo.table, self.file.boards[servo.board].clock, self.knots_of(joint))
 
     def knots_of(self, joint: str) -> tuple[float, ...]:
         """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range."""
@@ -187,10 +170,6 @@ class Setup:
     def pulses_of(self, joint: str) -> tuple[float, float]:
         borne, allowed = self.file.servos[joint].pulse_range, self.settings.pulses
         return max(borne[0], allowed[0]), min(borne[1], allowed[1])
-
-    @property
-    def clocks(self) -> dict[str, PulseClock]:
-        return {name: board.clock for name, board in self.file.boards.items()}
 
     def _clear_ranges(
         self, experiment: Experiment, limits: Mapping[str, tuple[float, float]]
@@ -257,8 +236,9 @@ class Setup:
 class PulsedJoints(JointDevice):
     """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end."""
 
-    def __init__(self, setup: Setup, tables: Tables | None = None) -> None:
-        self._setup, self._tables = setup, tables or setup.tables
+    def __init__(self, setup: Setup, servos: Mapping[str, KnownServo] = MappingProxyType({})) -> None:
+        self._setup, self._own = setup, {joint: setup.known(joint) for joint in setup.base}
+        self._servos = servos or self._own
         self._device: Any = setup.bench.device()  # a JointDevice and, as ``open`` checks, a PulseDevice
         self._set: dict[str, int] = {}
 
@@ -282,7 +262,7 @@ class PulsedJoints(JointDevice):
     @override
     def state(self) -> DeviceState:
         state = state_of(self._device)
-        self._set = {joint: _counts(*self._setup.table_of(joint), angle) for joint, angle in state.angles.items()}
+        self._set = {joint: _counts(self._own[joint], angle) for joint, angle in state.angles.items()}
         return DeviceState({joint: self.angle(joint, n) for joint, n in self._set.items()}, state.took_over)
 
     @override
@@ -305,8 +285,15 @@ class PulsedJoints(JointDevice):
 
     @override
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
-        """The device goes no farther than its own tables."""
-        return bool(self._device.guard([self._own(waypoint) for waypoint in waypoints], rate, after_s))
+        """The device has the angles of its own tables, and goes no farther than these."""
+
+        def own(joint: str, angle: float) -> float:
+            table = self._own[joint].table
+            same = float(table.angle(self.pulse(joint, self.counts(joint, angle))))
+            return min(max(same, table.angles[0]), table.angles[-1])
+
+        stated = [{joint: own(joint, angle) for joint, angle in waypoint.items()} for waypoint in waypoints]
+        return bool(self._device.guard(stated, rate, after_s))
 
     @override
     def release(self, joint: str) -> None:
@@ -318,30 +305,22 @@ class PulsedJoints(JointDevice):
         self._device.close()
 
     def angle(self, joint: str, counts: int) -> float:
-        return float(self._tables[joint][0].angle(self.pulse(joint, counts)))
+        return float(self._servos[joint].table.angle(self.pulse(joint, counts)))
 
     def pulse(self, joint: str, counts: int) -> float:
-        return counts * self._tables[joint][1].tick
+        return counts * self._servos[joint].clock.tick
 
     def counts(self, joint: str, angle: float) -> int:
-        return _counts(*self._tables[joint], angle)
+        return _counts(self._servos[joint], angle)
 
     def turn_counts(self, joint: str, turn: float) -> int:
         """The counts of a turn (rad) where the table has least."""
-        table, clock = self._tables[joint]
-        return max(int(turn * table.least_slope / clock.tick) - 1, 1)
+        servo = self._servos[joint]
+        return max(int(turn * servo.table.least_slope / servo.clock.tick) - 1, 1)
 
     def rises(self, joint: str) -> bool:
-        pulses = self._tables[joint][0].pulses
+        pulses = self._servos[joint].table.pulses
         return pulses[0] < pulses[-1]
-
-    def _own(self, angles: Mapping[str, float]) -> dict[str, float]:
-        own = {}
-        for joint, angle in angles.items():
-            table = self._setup.table_of(joint)[0]
-            same = float(table.angle(self.pulse(joint, self.counts(joint, angle))))
-            own[joint] = min(max(same, table.angles[0]), table.angles[-1])
-        return own
 
     def _allowed(self, joint: str, angle: float) -> int:
         counts, (low, high) = self.counts(joint, angle), self._setup.pulses_of(joint)
@@ -358,14 +337,13 @@ class PulsedJoints(JointDevice):
         self._set[joint] = counts
 
 
-def _counts(table: PulseTable, clock: PulseClock, angle: float) -> int:
-    return int(clock.counts(table.pulse(angle)))
+def _counts(servo: KnownServo, angle: float) -> int:
+    return int(servo.clock.counts(servo.table.pulse(angle)))
 
 
 BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of entries
 
 _SAME = 1e-6
-_ROTATION_OFF = 1e-6
 
 
 class Record:
@@ -397,7 +375,6 @@ class Record:
         return self._entries[0] if self._entries else None
 
     def set_aside(self) -> Path:
-        """Keep the journal under another name, which is given, and be empty."""
         self._opened()
         self._close()
         kept = next_name(self.path)
@@ -512,15 +489,12 @@ def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:
     }
 
 
-def stated_by(setup: Setup, begun: Any, joints: tuple[str, ...]) -> tuple[list[KnownServo], dict[str, PulseClock]]:
-    """Servos and boards' clocks as they were when the record was begun."""
-    servos, clocks = [], setup.clocks
-    for joint in joints:
-        stated = begun["servos"].get(joint)
-        if stated is None:
-            servos.append(setup.known(joint))
-            continue
-        table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
-        servos.append(replace(setup.known(joint), table=table))
-        clocks[stated["board"]] = PulseClock(stated["oscillator_hz"], stated["prescale"])
-    return servos, clocks
+def stated_by(setup: Setup, begun: Mapping[str, Any]) -> dict[str, KnownServo]:
+    """All servos, as they were when a record was begun."""
+    servos = {joint: setup.known(joint) for joint in setup.base}
+    for joint, stated in begun["servos"].items():
+        if joint in servos:
+            table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
+            clock = PulseClock(stated["oscillator_hz"], stated["prescale"])
+            servos[joint] = replace(servos[joint], table=table, clock=clock)
+    return servos

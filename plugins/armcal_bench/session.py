@@ -28,12 +28,12 @@ from armcal.plugins import blaming
 from armcal_bench import run_log
 from armcal_bench.bench import closing
 from armcal_bench.drive import Drive
-from armcal_bench.evidence import Evidence
 from armcal_bench.hazards import FirstMotion, ThermalLimit
 from armcal_bench.keys import OperatorInput
 from armcal_bench.preparation import LeaveOut, Measure, Prepared, Rest, Scheduler
 from armcal_bench.run_log import EndedHow, Log, Progress, RunLog, Start, opened_journal
 from armcal_bench.tracker_monitor import (
+    Evidence,
     MotionGate,
     Settled,
     StopRequested,
@@ -73,8 +73,6 @@ def known_poses(ids: Sequence[str], progress: Progress) -> dict[int, Array]:
 
 @dataclass
 class AcquisitionRun:
-    """One run over one plan, from its progress on, with a device that was opened with an identity."""
-
     _drive: Drive
     _identity: DeviceIdentity
     _scheduler: Scheduler
@@ -103,7 +101,11 @@ class AcquisitionRun:
             except (StopRequested, DeviceUnwellError) as request:
                 how: EndedHow = request.how if isinstance(request, StopRequested) else "parked"
                 if how == "parked" and self._when_stopped == "hold" and self._gate.asked_to_end():
-                    return self._hold_and_end(str(request))
+                    try:
+                        self._drive.hold()  # should the host fall silent too
+                    except DeviceError:
+                        return self._end("held", f"{request}, while the board was lost", _AS_IT_IS)
+                    return self._end("held", str(request))
                 return self._park_and_end(how, str(request))
             except ReconnectError as loss:
                 return self._end("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS)
@@ -285,13 +287,6 @@ class AcquisitionRun:
         self._left.remove(pose)
         self._on_progress(self._log.progress)
 
-    def _hold_and_end(self, why: str) -> Ending:
-        try:
-            self._drive.hold()
-        except DeviceError:
-            return self._end("held", f"{why}, while the board was lost", _AS_IT_IS)
-        return self._end("held", why)
-
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
         try:
             if not self._persist(self._park):
@@ -324,8 +319,6 @@ _SAME = {"plan": "plan", "config": "configuration"}
 
 @dataclass(frozen=True)
 class Conversation:
-    """How a run speaks with whom it is for."""
-
     asked_to_stop: Callable[[], bool]  # whether somebody wants its end
     may_energise: Callable[[FirstMotion], bool]  # asked once before anything moves, with what is dangerous in it
     report: Callable[[Progress, int], None] = lambda progress, total: None  # called after each of so many poses
@@ -381,23 +374,20 @@ def acquire(
                     with suppress(Exception):  # the journal holds it, whatever else is broken
                         run_log.write_measured(folder, experiment, log.progress, digests())
                 raise
-        summary = _summary(prepared, ending, log.progress)
-        summary |= {"gives_way": None if drift is None else drift.content}
-        summary |= {"board": log.identity.name if log.identity else "", "digests": digests()}
+        summary = {
+            "how": ending.how,
+            "why": ending.sentence,
+            "poses": len(prepared.plan),
+            "measured": len(log.progress.measured),
+            "left_out": dict(log.progress.left_out),
+            "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+            "times": "written" if run_log.in_order(log.progress) else "left out: the clock was set back during the run",
+            "gives_way": None if drift is None else drift.content,
+            "board": log.identity.name if log.identity else "",
+            "digests": digests(),
+        }
         run_log.write_outputs(folder, experiment, log.progress, summary)
         return Outcome(ending, summary)
-
-
-def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str, Any]:
-    return {
-        "how": ending.how,
-        "why": ending.sentence,
-        "poses": len(prepared.plan),
-        "measured": len(progress.measured),
-        "left_out": dict(progress.left_out),
-        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
-        "times": "written" if run_log.in_order(progress) else "left out: the clock was set back during the run",
-    }
 
 
 def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:

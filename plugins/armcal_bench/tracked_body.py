@@ -249,7 +249,6 @@ class BodyFit:
         return self.problem.parameters
 
     def fit(self, dataset: Dataset, weights: Array) -> None:
-        """To records like those that it was built with, from where the last fit ended."""
         self.problem = self.problem.of(dataset, weights)
         posed = PosedProblem(self.problem)
         self.values = posed.values(descended(posed, posed.x(self.values), _MOST_STEPS, _DAMPING, _AT_REST))
@@ -263,7 +262,6 @@ class BodyFit:
 
     @property
     def noise_scale(self) -> float:
-        """Of the residuals, in units of the stated noise; one at least."""
         freedom = max(self.problem.equations() - self.problem.increments, 1)
         return max(1.0, float(np.sqrt(2 * self.problem.cost(self.values) / freedom)))
 

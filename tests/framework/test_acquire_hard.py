@@ -24,11 +24,10 @@ from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
 from armcal_bench.bench import AcquisitionSettings, ArrivalSettings, Bench, ServoHeatSettings
 from armcal_bench.drive import Drive, PathPlanner
-from armcal_bench.evidence import Arrival
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.preparation import Rest
 from armcal_bench.session import Conversation, acquire
-from armcal_bench.tracker_monitor import TrackerMonitor
+from armcal_bench.tracker_monitor import Arrival, TrackerMonitor
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 

@@ -67,10 +67,10 @@ def angle_pulse(table, angle):
 
 def fitted(experiment, lines, zero="model"):
     (arm,) = experiment.system.arms.values()
-    known = [KnownServo("b", "only", STATED, KNOTS)]
+    known = [KnownServo("b", "only", STATED, CLOCK, KNOTS)]
     begun = {"kind": "begun", "servos": {}, "base": BASE}
     settings = ServoCalibrationSettings.si(zero=zero, sag="none", rotation_sd=1e-5)
-    return outcome_of([begun, *lines], known, {"only": CLOCK}, experiment, arm, settings)
+    return outcome_of([begun, *lines], known, experiment, arm, settings)
 
 
 def test_a_planted_table_and_lag_come_back(experiment) -> None:

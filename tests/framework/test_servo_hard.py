@@ -15,7 +15,7 @@ from armcal.devices.device import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
 from armcal_bench.drive import Drive
 from armcal_bench.hazards import HeatModel, ThermalState
-from armcal_bench.servo_outputs import improved, write_servo_file
+from armcal_bench.servo_fit import improved, write_servo_file
 from armcal_bench.servo_session import evaluated, measure
 from armcal_bench.servo_setup import Record
 from armcal_bench.session import Conversation
