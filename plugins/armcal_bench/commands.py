@@ -49,7 +49,6 @@ from armcal_bench.tracker_monitor import StopRequested, Waits, duration
 
 F = TypeVar("F", bound=Callable[..., Any])
 FILE = click.Path(path_type=Path)
-Question = Callable[[FirstMotion], bool]  # Whether the arm may be moved
 _MOST_TEXTS = 4096  # Kept for a terminal that takes nothing (Ctrl-S, a connection that hangs); of more, the oldest go
 _PATIENCE_S = 3.0  # How long the end of a command waits for it
 
@@ -121,10 +120,6 @@ def load(console: Console, config: Path, overrides: tuple[str, ...]) -> Experime
     return Experiment.load(config, overrides, registry=console.registry())
 
 
-def always(motion: FirstMotion) -> bool:
-    return True
-
-
 def ask(motion: FirstMotion) -> bool:
     named = ", ".join(motion.free or motion.measured or motion.powered)
     pulses = "get no pulses yet" if motion.free else "hang free" if motion.measured else "have pulses"
@@ -141,13 +136,13 @@ def ask(motion: FirstMotion) -> bool:
 
 
 @contextmanager
-def _talking(console: Console, question: Question) -> Iterator[Conversation]:
+def _talking(console: Console, yes: bool) -> Iterator[Conversation]:
     """Lines about what is waited for go to standard error: a progress bar alone does not say that."""
 
     def warn_and_ask(motion: FirstMotion) -> bool:
         for hazard in motion.hazards:  # whoever gave --yes reads them too
             console.warn(hazard.sentence)
-        return question(motion)
+        return yes or ask(motion)
 
     with Signals() as signals, console.progress() as show:
         yield Conversation(
@@ -160,16 +155,7 @@ def _talking(console: Console, question: Question) -> Iterator[Conversation]:
         )
 
 
-def energise_option(command: F) -> F:
-    return click.option(
-        "--yes",
-        "may_energise",
-        is_flag=True,
-        callback=lambda ctx, option, yes: always if yes else ask,
-        help="Move the arm without asking.",
-    )(command)
-
-
+_YES = click.option("--yes", is_flag=True, help="Move the arm without asking.")
 _ANGLE = 180 / math.pi
 _UNITS = {
     **dict.fromkeys(("limits", "first_pulse", "drop"), (_ANGLE, "deg")),
@@ -188,7 +174,7 @@ _UNITS = {
 @click.option("--resume", is_flag=True, help="Go on with the run in that folder.")
 @click.option("--dry-run", is_flag=True, help="Say what the run would take, and open nothing.")
 @click.option("--unchecked", is_flag=True, help="Drive servos too that no check has seen to be right.")
-@energise_option
+@_YES
 @on_bench
 def acquire_command(
     console: Console,
@@ -198,7 +184,7 @@ def acquire_command(
     resume: bool,
     dry_run: bool,
     unchecked: bool,
-    may_energise: Question,
+    yes: bool,
     overrides: tuple[str, ...],
 ) -> None:
     """Drive a plan's poses with the bench of CONFIG, and measure each when the arm stands."""
@@ -208,7 +194,7 @@ def acquire_command(
         return
     if out is None:
         raise InputError("found no --out.", hint="Say where data and journal are to be kept, or give --dry-run.")
-    outcome = _driven(console, prepared, plan, out, may_energise, resume=resume, unchecked=unchecked)
+    outcome = _driven(console, prepared, plan, out, yes=yes, resume=resume, unchecked=unchecked)
     sys.exit(_show_outcome(console, outcome, config, out))
 
 
@@ -241,11 +227,11 @@ def rehearse(
     overrides = (*overrides, f"bench.simulated={bench.absolute()}")
     if plan is not None:
         prepared = _prepared(console, config, plan, overrides)
-        outcome = _driven(console, prepared, plan, out, always, resume=resume, unchecked=True)
+        outcome = _driven(console, prepared, plan, out, yes=True, resume=resume, unchecked=True)
         account = outcome.summary["truth"] = _account(bench)
         code = _show_outcome(console, outcome, config, out)
     else:
-        given: dict[str, Any] = {"config": config, "overrides": overrides, "may_energise": always, "keep": True}
+        given: dict[str, Any] = {"config": config, "overrides": overrides, "yes": True, "keep": True}
         given |= {"as_json": console.json, "quiet": console.quiet, "verbose": console.verbose}
         given |= {"check": True} if how == "check" else {"out": out, "guided": how == "guided"}
         code = EXIT_DONE
@@ -272,11 +258,11 @@ def _forecast(prepared: Prepared) -> ScheduleForecast:
 
 
 def _driven(
-    console: Console, prepared: Prepared, plan: Path, out: Path, question: Question, *, resume: bool, unchecked: bool
+    console: Console, prepared: Prepared, plan: Path, out: Path, *, yes: bool, resume: bool, unchecked: bool
 ) -> Outcome:
     if not console.json:
         _show_forecast(console, prepared, _forecast(prepared))
-    with _talking(console, question) as talk:
+    with _talking(console, yes) as talk:
         return acquire(prepared, plan, out, "resume" if resume else "anew", talk, unchecked=unchecked)
 
 
@@ -393,7 +379,7 @@ def _show_account(console: Console, account: dict[str, Any]) -> None:
 @click.option("--release", is_flag=True, help="Let go of the servos, from the base pose, at the end.")
 @click.option("--evaluate", is_flag=True, help="Measure nothing: fit what the folder holds, and write the tables.")
 @click.option("--keep", is_flag=True, help="Leave the servo file as it is.")
-@energise_option
+@_YES
 @on_bench
 def servo(
     console: Console,
@@ -405,14 +391,14 @@ def servo(
     release: bool,
     evaluate: bool,
     keep: bool,
-    may_energise: Question,
+    yes: bool,
     overrides: tuple[str, ...],
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     experiment = load(console, config, overrides)
     is_bus = check and not guided and servo_file_of(experiment.source) is None
     setup = None if is_bus else Setup.of(experiment)
-    with _talking(console, may_energise) as talk, _stoppable(console):
+    with _talking(console, yes) as talk, _stoppable(console):
         if setup is None:
             result = check_joints(experiment, talk)
             _show_verdicts(console, result.verdicts, [], result.far_zeros, result.notes)

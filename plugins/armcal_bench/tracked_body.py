@@ -69,11 +69,8 @@ class RigidArm:
     def tool(self, pose: Pose) -> Array:
         return np.asarray(self._function(self._commands(pose))[0].full())
 
-    def axis(self, joint: str, pose: Pose) -> tuple[Array, Array]:
-        """A joint's axis in the base frame: its direction (unit) and a point on it (m)."""
-        return self.axes(pose)[joint]
-
     def axes(self, pose: Pose) -> dict[str, tuple[Array, Array]]:
+        """Of each joint in the base frame: the direction of its axis (unit) and a point on it (m)."""
         _, axes, origins = (np.asarray(dm.full()) for dm in self._function(self._commands(pose)))
         return {name: (axes[:, i], origins[:, i]) for i, name in enumerate(self.arm.joint_names)}
 
