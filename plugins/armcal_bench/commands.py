@@ -396,14 +396,16 @@ def servo(
 ) -> None:
     """Find which pulse makes which angle of each servo on the bench of CONFIG, and write the servo file."""
     experiment = load(console, config, overrides)
-    is_bus = check and not guided and servo_file_of(experiment.source) is None
+    if check and guided:
+        raise InputError("found --check and --guided.", hint="Give one of them: the check needs a tracker.")
+    is_bus = check and servo_file_of(experiment.source) is None
     setup = None if is_bus else Setup.of(experiment)
     with _talking(console, yes) as talk, _stoppable(console):
         if setup is None:
             result = check_joints(experiment, talk)
             _show_verdicts(console, result.verdicts, [], result.far_zeros, result.notes)
         elif check:
-            verdicts = tried(setup, talk, "somebody" if guided else "tracker")
+            verdicts = tried(setup, talk)
             _show_verdicts(console, verdicts, swapped(verdicts))
         elif not parks and not (release and out is None):
             if out is None:

@@ -199,18 +199,6 @@ def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
                         yield _Wiring(moves, {joint: -1 if joint in turned else 1 for joint in joints})
 
 
-QUESTION = (
-    "{joint} was commanded to turn by {degrees:+.0f} deg. y: it did, r: the other way, o: another joint did, "
-    "n: nothing moved"
-)
-
-
-def answered(joint: str, commanded: float, answer: str) -> Verdict:
-    kinds = {"y": ("right", commanded), "r": ("reversed", -commanded), "o": ("another", math.nan), "n": ("still", 0.0)}
-    kind, turned = kinds.get(answer, ("unclear", math.nan))
-    return _verdict(kind, joint, commanded, turned, "another joint" if kind == "another" else "")
-
-
 def swapped(verdicts: list[Verdict]) -> list[str]:
     went = {v.joint: v.other for v in verdicts if v.kind == "another"}
     return [
@@ -250,7 +238,7 @@ def _verdict(kind: str, joint: str, commanded: float, turned: float, other: str 
             "Check its servo's type and its table's angles; then calibrate it.",
         ),
         "another": (
-            f"{joint} was commanded {size}, and {other} turned{'' if math.isnan(turned) else f' by {seen}'}.",
+            f"{joint} was commanded {size}, and {other} turned by {seen}.",
             f"Give {joint} the channel of {other} in the servo file, or change the plugs.",
         ),
         "still": (f"{joint} was commanded {size} and did not move.", "Check its plug, its channel and its supply."),

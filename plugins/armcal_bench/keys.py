@@ -20,9 +20,8 @@ SERVO_KEYS: Mapping[str, str] = {
     **dict.fromkeys(("\x1b[B", "\x1bOB", "-"), "-1"),
     **{"\x1b[5~": "+10", "\x1b[6~": "-10", "\r": "ok", "\n": "ok", "s": "skip", "b": "back"},
     **dict.fromkeys(("q", "\x03", "\x04"), QUIT),
-    **{answer: answer for answer in "yron"},
 }
-"""Of a guided servo calibration: steps in microseconds, what becomes of a point, and answers."""
+"""Of a guided servo calibration: steps in microseconds, and what becomes of a point."""
 RECORDING_KEYS: Mapping[str, str] = {
     **{chr(code): chr(code) for code in range(0x21, 0x7F)},
     **{"\r": "c", "\n": "c", "\x04": END},

@@ -16,7 +16,7 @@ from armcal.errors import InputError, Location
 from armcal_bench.bench import closing
 from armcal_bench.drive import Drive
 from armcal_bench.hazards import COOLED_TO
-from armcal_bench.joint_check import QUESTION, Verdict, answered, check_ended, noted, turned_a_little
+from armcal_bench.joint_check import Verdict, check_ended, noted, turned_a_little
 from armcal_bench.keys import QUIT, OperatorInput
 from armcal_bench.run_log import Log
 from armcal_bench.servo_fit import Outcome, outcome_of
@@ -153,7 +153,7 @@ def _directed(
                 hint = "Bring it nearer by armcal servo --guided, or release it and put it there by hand."
                 raise DeviceRefusedError("no way to the base pose is clear from where the arm stands.", hint=hint)
             drive.go(path, gate.resting)
-            yield Directed(device, drive, gate, identity)
+            yield Directed(device, drive, gate)
         except StopRequested as stop:
             try:
                 drive.hold()
@@ -167,7 +167,6 @@ class Directed:
     device: PulsedJoints
     drive: Drive
     gate: MotionGate
-    identity: DeviceIdentity
 
     def counts(self, joint: str) -> int:
         return self.device.counts(joint, self.drive.angles[joint])
@@ -295,28 +294,18 @@ def done_in(record: Record) -> set[tuple[str, int, int]]:
     return {Target(line["joint"], line["target"], line["came"]).key for line in lines}
 
 
-def tried(setup: Setup, talk: Conversation, seen: str) -> list[Verdict]:
-    """Move each joint a little, judge by ``tracker`` or ``somebody`` what it did, and note which are checked."""
+def tried(setup: Setup, talk: Conversation) -> list[Verdict]:
+    """Move each joint a little, judge by the tracker what it did, and note which are checked."""
     record = WiringRecord.of_servo_file(setup.path, setup.file)
     turns: dict[str, float] = {}
     for joint in setup.joints:
         (low, high), at, size = setup.ranges[joint], setup.base[joint], setup.settings.check
         turns[joint] = size if high - at >= size or high - at >= at - low else -size  # to where it has room
     with setup.bench.clock() as clock:
-        if seen == "tracker":
-            device = PulsedJoints(setup)
-            turned = turned_a_little(lambda poses: setup.run(device, poses), setup.base, turns, talk, clock)
-            identity, verdicts = turned.identity, turned.judged(setup.base, setup.nominal)
-        else:
-            with _directed(setup, clock, talk) as arm, talk.operator() as operator:
-                identity, verdicts = arm.identity, []
-                for joint, turn in turns.items():
-                    counts = arm.counts(joint)
-                    arm.go(joint, arm.device.counts(joint, setup.base[joint] + turn))
-                    talk.say(QUESTION.format(joint=joint, degrees=math.degrees(turn)))
-                    verdicts.append(answered(joint, turn, arm.next_word(operator)))
-                    arm.go(joint, counts)
-        noted(record, verdicts, {"adapter": identity.adapter, "by": seen, "at": clock.wall()})
+        device = PulsedJoints(setup)
+        turned = turned_a_little(lambda poses: setup.run(device, poses), setup.base, turns, talk, clock)
+        verdicts = turned.judged(setup.base, setup.nominal)
+        noted(record, verdicts, {"adapter": turned.identity.adapter, "by": "tracker", "at": clock.wall()})
     return verdicts
 
 
