@@ -36,7 +36,7 @@ from armcal.version import JSON_SCHEMA
 from armcal_bench.bench import SECTION, Bench
 from armcal_bench.hazards import FirstMotion
 from armcal_bench.joint_check import Verdict, check_joints, swapped
-from armcal_bench.keys import QUIT, RECORDING_KEYS, SERVO_KEYS, OperatorInput, operator_input
+from armcal_bench.keys import QUIT, RECORDING_KEYS, SERVO_KEYS, operator_input
 from armcal_bench.postures import IMAGES
 from armcal_bench.preparation import LeaveOut, Prepared, Rest, ScheduleForecast, forecast_schedule, prepare
 from armcal_bench.recorder import KEYS, LOOK, Message, record
@@ -494,7 +494,6 @@ def _document(content: Mapping[str, Any], joints: Sequence[str]) -> Document:
     return Document("Servos", headline, sections, summary=content["findings"], data=content)
 
 
-_TERMINAL = Path("/dev/tty")
 _AS_CSV = "--set 'data={type: csv}' "  # For a run whose configuration reads another kind of data
 
 
@@ -544,8 +543,16 @@ def record_command(
         elif not console.quiet:
             say(message.sentence)
 
-    with Signals() as signals, _keys(bench, capture) as (keys, is_terminal):
-        if is_terminal and not console.quiet:
+    descriptor = None
+    if (bench.settings.joints or {}).get("source") != STANDARD_INPUT:
+        descriptor = sys.stdin.fileno()
+    elif capture == "keys":
+        raise InputError(
+            "standard input gives the joint readings, so no key can start a capture.",
+            hint="Give --capture still, or let the readings come from udp:PORT or a file.",
+        )
+    with Signals() as signals, operator_input(descriptor, RECORDING_KEYS) as keys:
+        if descriptor is not None and os.isatty(descriptor) and not console.quiet:
             click.echo(f"{KEYS}.{f' {LOOK}.' if bench.settings.camera else ''}", err=True)
         start: Start = "resume" if resume else "anew"
         ending = record(bench, (out, start), capture, keys, lambda: signals.finish or signals.rotate, show)
@@ -569,26 +576,3 @@ def _with_source(source: ConfigSource, part: str, usual: str, option: str, named
     section: dict[str, Any] = {**(there if isinstance(there, dict) else {"type": ConfigText(usual)}), "source": name}
     whole = {**(bench if isinstance(bench, dict) else {}), part: section}
     return replace(source, data={**source.data, SECTION: whole})
-
-
-@contextmanager
-def _keys(bench: Bench, capture: str) -> Iterator[tuple[OperatorInput, bool]]:
-    """What a person types, and whether that is a terminal; never what the joint readings come from."""
-    if (bench.settings.joints or {}).get("source") != STANDARD_INPUT:
-        descriptor, opened = sys.stdin.fileno(), None
-    else:
-        descriptor = opened = None
-        if sys.stderr.isatty():  # somebody looks at it
-            with suppress(OSError):
-                descriptor = opened = os.open(_TERMINAL, os.O_RDWR | os.O_CLOEXEC)
-        if opened is None and capture == "keys":
-            raise InputError(
-                "standard input gives the joint readings and there is no terminal, so no key can start a capture.",
-                hint="Give --capture still, or let the readings come from udp:PORT or a file.",
-            )
-    try:
-        with operator_input(descriptor, RECORDING_KEYS) as operator:
-            yield operator, descriptor is not None and os.isatty(descriptor)
-    finally:
-        if opened is not None:
-            os.close(opened)
