@@ -28,78 +28,60 @@ from armcal_bench.postures import RecordingSettings
 
 
 class ServoHeatSettings(Settings):
-    """How a servo heats: steadily under ``continuous`` torque it comes to its limit in the end.
+    """How a servo heats: its winding soon, its case slowly."""
 
-    ``winding_share`` of that comes within ``winding_time``, the rest with the slow ``case_time``. A servo may be given
-    as much of its limit as ``budget``: 0.5 is safe where each of these numbers is wrong by 30 %.
-    """
-
-    continuous: Annotated[Torque, Field(gt=0)]
+    continuous: Annotated[Torque, Field(gt=0)]  # held for ever, it leads to the limit
     winding_time: Annotated[Duration, Field(gt=0)] = 60.0
     case_time: Annotated[Duration, Field(gt=0)] = 900.0
-    winding_share: Annotated[float, Field(ge=0, le=1)] = 0.3
-    budget: Annotated[float, Field(gt=0, le=1)] = 0.5
+    winding_share: Annotated[float, Field(ge=0, le=1)] = 0.3  # of the heat; the rest is the case's
+    budget: Annotated[float, Field(gt=0, le=1)] = 0.5  # of the limit; 0.5 is safe where each number is wrong by 30 %
 
 
 class SettleSettings(Settings):
-    """When the arm stands: the mean of the last ``window`` is taken once positions scatter by less than ``spread``.
+    """When the arm stands."""
 
-    ``spread`` is of the mean's halves: they differ by less. ``wait`` passes first; after ``longest`` the pose is left.
-    """
-
-    wait: Duration = 0.5
-    window: Duration = 1.0
-    spread: Length = 0.0005
-    longest: Duration = 15.0
+    wait: Duration = 0.5  # before the window
+    window: Duration = 1.0  # whose mean is taken
+    spread: Length = 0.0005  # by which its halves differ at most
+    longest: Duration = 15.0  # after which the pose is left
     frames: Annotated[int, Field(ge=2)] = 10
 
 
 class ArrivalSettings(Settings):
     """How far the arm may be from where it was commanded to be, by distances and turns between measured poses.
 
-    More than ``astray``, or ``astray_turned``, is no error of the model but a servo that failed, stalls or lost a
-    tooth, or a body that slipped: such a pose is tried again, then left out. After ``in_a_row`` of them the arm parks
-    and the run ends.
+    More is no error of the model but a servo that failed, stalls or lost a tooth, or a body that slipped.
     """
 
     astray: Annotated[Length, Field(gt=0)] = 0.1
     astray_turned: Annotated[Angle, Field(gt=0)] = 0.45
-    in_a_row: Annotated[int, Field(ge=1)] = 3
+    in_a_row: Annotated[int, Field(ge=1)] = 3  # after which the arm parks and the run ends
 
 
 class LostSettings(Settings):
-    """A tracker that is silent, frozen or blind for ``hold`` makes the arm hold; for ``park``, park."""
+    """For how long a tracker is silent, frozen or blind until the arm holds, and parks."""
 
     hold: Duration = 0.5
     park: Duration = 30.0
 
 
 class AcquisitionSettings(Settings):
-    """How the plan is driven.
-
-    ``limits`` of joints are those of ``plan`` where none are given here. ``park`` is where the arm is safe, cool and
-    stays when it is left alone; joints that it does not name park at zero. Without ``heat`` no heat is reckoned with.
-    The board waits for ``silence`` of the host before it parks the arm by itself, where its link can. At the end the
-    arm parks, and its servos are let go one by one, or hold. Joints get their first pulses one by one,
-    ``between_joints`` apart. ``temperature`` is that of the room, where it is known; it is written with the data.
-    ``angles`` are those that the dataset has: as commanded, or as servos that know where they stand have measured them;
-    the others stand beside them.
-    """
+    """How the plan is driven."""
 
     rate_deg_per_s: Annotated[float, Field(gt=0, le=180)] = 20.0
     period: Duration = 0.02
-    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
-    park: dict[str, Angle] = Field(default_factory=dict)
+    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)  # else those of the plan, else the model's
+    park: dict[str, Angle] = Field(default_factory=dict)  # where the arm is safe, cool and left alone; others at zero
     path_step: Angle = 0.0175
     settle: SettleSettings = Field(default_factory=SettleSettings)
     arrival: ArrivalSettings = Field(default_factory=ArrivalSettings)
     lost: LostSettings = Field(default_factory=LostSettings)
-    heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)
-    silence: Duration = 1.0
+    heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)  # without it no heat is reckoned with
+    silence: Duration = 1.0  # of the host, after which a board that can parks the arm by itself
     at_end: Literal["release", "hold"] = "release"
-    between_joints: Duration = 0.5
-    temperature: Temperature | None = None
-    angles: Literal["commanded", "measured"] = "commanded"
+    between_joints: Duration = 0.5  # between the first pulses of two joints
+    temperature: Temperature | None = None  # of the room; it is written with the data
+    angles: Literal["commanded", "measured"] = "commanded"  # that the dataset has; the others stand beside them
     seed: Annotated[int, Field(ge=0)] = 0
 
 
@@ -113,15 +95,11 @@ Name = Annotated[str, Field(min_length=1, max_length=100)]
 
 
 class BodySettings(Settings):
-    """The bodies by the tracker's own names, and what is known about where they sit.
-
-    With a ``moving`` base each frame is taken in the base body's own pose of that frame; with a ``still`` one the base
-    body's poses of all frames of a capture are averaged first.
-    """
+    """The bodies by the tracker's own names, and what is known about where they sit."""
 
     tool: Name = "tool"  # the body on the tool
     base: Name = NONE  # the body that stands still with the arm's base; ``none`` where the tracker's world does
-    base_motion: Literal["moving", "still"] = "moving"
+    base_motion: Literal["moving", "still"] = "moving"  # of a still one the poses of a capture are averaged
     # where the base body (or the tracker's world, without one) is in the arm's base frame
     base_T_reference: PoseSettings = Field(default_factory=PoseSettings)
     tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)  # where the measured target is on the tool
@@ -225,13 +203,9 @@ SECTION = "bench"
 
 
 class BenchSettings(Settings):
-    """Components keep their own settings under ``type``.
+    """Components keep their own settings under ``type``."""
 
-    ``bodies`` says which of the tracker's bodies is what. ``simulated`` is the folder of a simulated bench (that of
-    ``simulator``) that stands in for device, tracker and joint readings; without it they are the real ones.
-    """
-
-    simulated: InputPath | None = None
+    simulated: InputPath | None = None  # the folder of a simulated bench that stands in for the real parts
     link: dict[str, Any] | None = None
     device: dict[str, Any] | None = None
     tracker: dict[str, Any] | None = None

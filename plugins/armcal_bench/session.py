@@ -382,7 +382,7 @@ def acquire(
             "left_out": dict(log.progress.left_out),
             "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
             "times": "written" if run_log.in_order(log.progress) else "left out: the clock was set back during the run",
-            "gives_way": None if drift is None else drift.content,
+            "gives_way": drift,
             "board": log.identity.name if log.identity else "",
             "digests": digests(),
         }

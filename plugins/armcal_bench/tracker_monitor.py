@@ -398,7 +398,19 @@ def frame_mistake(expected: Array, seen: Array) -> FrameMistake | None:
     fitting.sort(key=lambda other: other.left)
     plain = next((other for other in fitting if not other.is_mirrored), fitting[0])
     best = fitting[0] if fitting[0].left < plain.left / MUCH_BETTER else plain
-    return _mistake(best, len(seen))
+    parts, mends = [], []
+    if not 1 / _GAIN_OFF < best.gain < _GAIN_OFF:
+        names = length_mistake(best.gain)
+        unit = f", as if {names[0]} came where {names[1]} are expected" if names else ", which is no usual unit"
+        parts.append(f"measured distances are {best.gain:.4g} times those of the model{unit}")
+        mends.append("State the unit in which the tracker gives positions, or let it give the expected one.")
+    if best.is_mirrored:
+        of = "positions and rotations are" if best.with_rotations else "positions are"
+        parts.append(
+            f"measured {of} mirrored: the frame is left-handed (one axis points the other way, or two are exchanged)"
+        )
+        mends.append("Reverse one axis of the tracker's frame, or exchange two, so that it is right-handed.")
+    return FrameMistake(f"{', and '.join(parts)} (by {len(seen)} poses)", " ".join(mends), best)
 
 
 def _fitted(expected: Array, seen: Array, stated: float | None, mirror: float, with_rotations: bool) -> MeasuredFrame:
@@ -462,26 +474,9 @@ def _target(expected: Array, goals: Array) -> Array:
     return np.asarray(target * min(1.0, _MOST_TARGET_M / max(float(np.linalg.norm(target)), _TINY)))
 
 
-def _mistake(frame: MeasuredFrame, count: int) -> FrameMistake:
-    parts, mends = [], []
-    if not 1 / _GAIN_OFF < frame.gain < _GAIN_OFF:
-        names = length_mistake(frame.gain)
-        unit = f", as if {names[0]} came where {names[1]} are expected" if names else ", which is no usual unit"
-        parts.append(f"measured distances are {frame.gain:.4g} times those of the model{unit}")
-        mends.append("State the unit in which the tracker gives positions, or let it give the expected one.")
-    if frame.is_mirrored:
-        of = "positions and rotations are" if frame.with_rotations else "positions are"
-        parts.append(
-            f"measured {of} mirrored: the frame is left-handed (one axis points the other way, or two are exchanged)"
-        )
-        mends.append("Reverse one axis of the tracker's frame, or exchange two, so that it is right-handed.")
-    return FrameMistake(f"{', and '.join(parts)} (by {count} poses)", " ".join(mends), frame)
-
-
 _ENOUGH = 5
 _SURE, _FEWEST_STANDS = 2.5, 3  # Standard deviations, in each of most stands
-_MINUTE = 60.0
-_LEAST_SPEED = 0.001 / _MINUTE  # m/s: a servo that comes to rest moves so much
+_MM_PER_MIN, _LEAST_MM_PER_MIN = 60_000.0, 1.0  # A servo that comes to rest moves so much
 
 
 @dataclass(frozen=True)
@@ -528,34 +523,6 @@ def _worst(differences: Array) -> float:
     return float(finite[1 if len(finite) >= _ENOUGH else 0]) if len(finite) else np.nan
 
 
-@dataclass(frozen=True)
-class Drift:
-    speed: float  # root mean square (m/s)
-    poses: int  # in how many it was seen
-
-    @classmethod
-    def of(cls, stands: Sequence[Stand]) -> "Drift | None":
-        if len(stands) < _FEWEST_STANDS:
-            return None
-        rates, sds = (np.array([getattr(stand, name) for stand in stands]) for name in ("rates", "sds"))
-        moving = int(np.sum(np.sqrt(np.mean((rates / sds) ** 2, axis=1)) > _SURE))
-        speed = float(np.sqrt(np.mean(np.sum(rates**2, axis=1))))
-        return cls(speed, moving) if 2 * moving > len(stands) and speed > _LEAST_SPEED else None
-
-    @property
-    def sentence(self) -> str:
-        speed = _MINUTE * 1000 * self.speed
-        return (
-            f"the target moves by {speed:.{1 if speed < 10 else 0}f} mm/min while the arm should stand (in "
-            f"{self.poses} poses): a joint gives way. Look at the screws of the horns, at gears and supply; a servo "
-            "that is too weak for its load gives way as well: measure poses in which it carries less"
-        )
-
-    @property
-    def content(self) -> dict[str, Any]:
-        return {"mm_per_min": _MINUTE * 1000 * self.speed, "poses": self.poses, "what": f"{self.sentence}."}
-
-
 class Evidence:
     def __init__(
         self,
@@ -584,13 +551,27 @@ class Evidence:
         if self._failed < self.arrival.settings.in_a_row:
             return
         if (drift := self.drift(self._failed)) is not None:
-            raise StopRequested(drift.sentence, how="failed")
+            raise StopRequested(drift["what"].rstrip("."), how="failed")
         if self._restless_ends:
             text = f"the arm did not come to stand {self._failed} times in a row ({why})"
             raise StopRequested(f"{text}: does a servo stall, or let go?", how="failed")
 
-    def drift(self, last: int = 0) -> Drift | None:
-        return Drift.of([stand for _, stand in self._stands[-last:]])
+    def drift(self, last: int = 0) -> dict[str, Any] | None:
+        """A motion of the target that most of the last stands, or of all, show; three at least."""
+        stands = [stand for _, stand in self._stands[-last:]]
+        if len(stands) < _FEWEST_STANDS:
+            return None
+        rates, sds = (np.array([getattr(stand, name) for stand in stands]) for name in ("rates", "sds"))
+        moving = int(np.sum(np.sqrt(np.mean((rates / sds) ** 2, axis=1)) > _SURE))
+        speed = _MM_PER_MIN * float(np.sqrt(np.mean(np.sum(rates**2, axis=1))))
+        if 2 * moving <= len(stands) or speed <= _LEAST_MM_PER_MIN:
+            return None
+        sentence = (
+            f"the target moves by {speed:.{1 if speed < 10 else 0}f} mm/min while the arm should stand (in "
+            f"{moving} poses): a joint gives way. Look at the screws of the horns, at gears and supply; a servo "
+            "that is too weak for its load gives way as well: measure poses in which it carries less."
+        )
+        return {"mm_per_min": speed, "poses": moving, "what": sentence}
 
     def mistake(self, measured: Mapping[int, Array]) -> FrameMistake | None:
         glimpsed = {pose: stand.base_T_target for pose, stand in self._stands}
