@@ -4,12 +4,12 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 from armcal.devices.clock import Clock
-from armcal.devices.device import DeviceError, DeviceIdentity, DeviceRefusedError, open_device, state_of
+from armcal.devices.device import DeviceError, DeviceRefusedError, open_device, state_of
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError, Location
 
@@ -50,8 +50,9 @@ def measure(setup: Setup, folder: Path, talk: Conversation, how: str) -> None:
             targets = targets_of(setup)
             if done_in(record).issuperset(target.key for target in targets):
                 return
-            with _directed(setup, clock, talk, record, servos) as arm, talk.operator() as operator:
-                Guided(setup, arm, operator, record, talk.say).run(targets)
+            device = PulsedJoints(setup, servos)
+            with _directed(setup, device, clock, talk, record) as (drive, gate), talk.operator() as operator:
+                Guided(setup, device, drive, gate, operator, record, talk.say).run(targets)
         else:
             _tracked(setup, clock, talk, servos, record)
 
@@ -100,18 +101,14 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, servos: Mapping[str
             check_same(setup, record, open_device(device, clock))
         return
     prepared = setup.run(device, poses, sides)
-
-    def check(identity: DeviceIdentity) -> None:
-        check_same(setup, record, identity)
-        model = prepared.scheduler.model
-        hot = model.too_hot_for_ever(model.torques(prepared.scheduler.park), COOLED_TO)
-        if hot is not None:
-            named = f"the servo of {device.joint_names[hot]} would not cool in the base pose, by bench.acquisition.heat"
-            hint = "Give bench.servo.base a pose in which it carries less."
-            raise InputError(f"{named}; nothing was moved.", hint=hint)
-
+    model = prepared.scheduler.model
+    if (hot := model.too_hot_for_ever(model.torques(prepared.scheduler.park), COOLED_TO)) is not None:
+        named = f"the servo of {device.joint_names[hot]} would not cool in the base pose, by bench.acquisition.heat"
+        hint = "Give bench.servo.base a pose in which it carries less."
+        raise InputError(f"{named}; nothing was moved.", hint=hint)
     evidence = Evidence(prepared.arrival, is_tolerated, restless_ends=True)
-    ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, lambda one, at: begin(setup, record, one))
+    same, starts = partial(check_same, setup, record), partial(begin, setup, record)
+    ending, _ = drive_poses(prepared, talk, log, clock, evidence, same, starts)
     if ending.how == "refused":
         hint = "Correct that. Then give another --out."
         if first <= 1:
@@ -124,15 +121,13 @@ def _tracked(setup: Setup, clock: Clock, talk: Conversation, servos: Mapping[str
 @contextmanager
 def _directed(
     setup: Setup,
+    device: PulsedJoints,
     clock: Clock,
     talk: Conversation,
     record: Record | None = None,
-    servos: Mapping[str, KnownServo] = MappingProxyType({}),
-    *,
     releases: bool = False,
-) -> Iterator["Directed"]:
+) -> Iterator[tuple[Drive, MotionGate]]:
     """An arm that somebody moves joint by joint, in its base pose; it holds when it is stopped."""
-    device = PulsedJoints(setup, servos)
     prepared, settings = setup.run(device, {"base": {}}), setup.acquisition
     gate = MotionGate(None, clock, settings.lost, talk.asked_to_stop, talk.waits)
     with closing(device):
@@ -153,49 +148,13 @@ def _directed(
                 hint = "Bring it nearer by armcal servo --guided, or release it and put it there by hand."
                 raise DeviceRefusedError("no way to the base pose is clear from where the arm stands.", hint=hint)
             drive.go(path, gate.resting)
-            yield Directed(device, drive, gate)
+            yield drive, gate
         except StopRequested as stop:
             try:
                 drive.hold()
             except DeviceError:
                 raise StopRequested(f"{stop}, while the board was lost", _AS_IT_IS) from stop
             raise
-
-
-@dataclass(frozen=True)
-class Directed:
-    device: PulsedJoints
-    drive: Drive
-    gate: MotionGate
-
-    def counts(self, joint: str) -> int:
-        return self.device.counts(joint, self.drive.angles[joint])
-
-    def came(self, joint: str) -> int:
-        """From where it came last: 1 with rising pulses, -1 with falling ones, 0 not known or within its play."""
-        side = int(self.drive.approach[self.drive.joints.index(joint)])
-        return side if self.device.rises(joint) else -side
-
-    def go(self, joint: str, counts: int) -> None:
-        goal = self.drive.at.copy()
-        goal[self.drive.joints.index(joint)] = self.device.angle(joint, counts)
-        self.drive.go((self.drive.at, goal), self.gate.resting)
-
-    def come_to(self, joint: str, counts: int, came: int, aside: int) -> None:
-        """With rising pulses (1) or falling ones (-1), and the play taken up from the counts ``aside``."""
-        if self.came(joint) != came or came * (counts - self.counts(joint)) < 0:
-            self.go(joint, aside)
-        self.go(joint, counts)
-
-    def next_word(self, operator: OperatorInput) -> str:
-        while True:
-            word = operator.next(_LOOK_S)
-            word = word and word.strip().lower()
-            if word == QUIT or self.gate.asked_to_end():
-                raise StopRequested("it was asked to stop")
-            if word:
-                return word
-            self.drive.keep_alive()
 
 
 @dataclass(frozen=True)
@@ -216,7 +175,9 @@ class Guided:
     """A calibration by eye. What is in the record is not asked for again."""
 
     setup: Setup
-    arm: Directed
+    device: PulsedJoints
+    drive: Drive
+    gate: MotionGate
     operator: OperatorInput
     record: Record
     say: Callable[[str], None]
@@ -234,26 +195,46 @@ class Guided:
 
     def _ask(self, target: Target) -> str:
         """One target: the word that ended it, ``ok``, ``skip`` or ``back``."""
-        joint, arm, device = target.joint, self.arm, self.arm.device
+        joint, device = target.joint, self.device
         pulse = device.pulse(joint, self._within(joint, device.counts(joint, target.angle)))
         side = "rising" if target.came > 0 else "falling"
         room = device.turn_counts(joint, self.setup.settings.approach)
         self.say(f"put {joint} at {math.degrees(target.angle):g} deg, coming with {side} pulses")
         while True:
             counts = self._within(joint, round(pulse / device.pulse(joint, 1)))
-            arm.come_to(joint, counts, target.came, self._within(joint, counts - target.came * room))
-            set_us = 1e6 * device.pulse(joint, arm.counts(joint))
-            self.say(f"  {joint}: {1e6 * pulse:.0f} us asked, {set_us:.1f} us set")
-            word = arm.next_word(self.operator)
-            line = {"joint": joint, "target": target.angle, "came": target.came, "at": arm.drive.clock.wall()}
+            self._come_to(joint, counts, target.came, self._within(joint, counts - target.came * room))
+            set_to = device.counts(joint, self.drive.angles[joint])
+            self.say(f"  {joint}: {1e6 * pulse:.0f} us asked, {1e6 * device.pulse(joint, set_to):.1f} us set")
+            word = self._next_word()
+            line = {"joint": joint, "target": target.angle, "came": target.came, "at": self.drive.clock.wall()}
             if word == "ok":
                 measured = {"angle": target.angle, "sd": self.setup.settings.guided_sd}
-                self.record.append(ANGLE, {**line, "counts": arm.counts(joint), **measured})
+                self.record.append(ANGLE, {**line, "counts": set_to, **measured})
             elif word == "skip":
                 self.record.append(LEFT_OUT, {**line, "why": "it was skipped"})
             if word in ("ok", "skip", "back"):
                 return word
             pulse = self._stepped(joint, pulse, word)
+
+    def _come_to(self, joint: str, counts: int, came: int, aside: int) -> None:
+        """With rising pulses (1) or falling ones (-1), and the play taken up from the counts ``aside``."""
+        drive, device, i = self.drive, self.device, self.drive.joints.index(joint)
+        side = int(drive.approach[i]) * (1 if device.rises(joint) else -1)  # from where it came last; 0 not known
+        is_past = came * (counts - device.counts(joint, drive.angles[joint])) < 0
+        for at in (aside, counts) if side != came or is_past else (counts,):
+            goal = drive.at.copy()
+            goal[i] = device.angle(joint, at)
+            drive.go((drive.at, goal), self.gate.resting)
+
+    def _next_word(self) -> str:
+        while True:
+            word = self.operator.next(_LOOK_S)
+            word = word and word.strip().lower()
+            if word == QUIT or self.gate.asked_to_end():
+                raise StopRequested("it was asked to stop")
+            if word:
+                return word
+            self.drive.keep_alive()
 
     def _stepped(self, joint: str, pulse: float, word: str) -> float:
         """A pulse (s) after a step in microseconds; as it was where the step is none, or leads out of the range."""
@@ -274,7 +255,7 @@ class Guided:
 
     def _within(self, joint: str, counts: int) -> int:
         low, high = self.setup.pulses_of(joint)
-        tick = self.arm.device.pulse(joint, 1)
+        tick = self.device.pulse(joint, 1)
         return min(max(counts, math.ceil(low / tick)), math.floor(high / tick))
 
 
@@ -310,7 +291,8 @@ def tried(setup: Setup, talk: Conversation) -> list[Verdict]:
 
 
 def park(setup: Setup, talk: Conversation, how: str) -> None:
-    with setup.bench.clock() as clock, _directed(setup, clock, talk, releases=how == "release") as arm:
-        arm.drive.hold()
-        if how == "release":
-            arm.drive.release()
+    device, releases = PulsedJoints(setup), how == "release"
+    with setup.bench.clock() as clock, _directed(setup, device, clock, talk, releases=releases) as (drive, _):
+        drive.hold()
+        if releases:
+            drive.release()

@@ -357,6 +357,9 @@ def acquire(
                     hint="Connect the board that the run began with, with the servo file that it began with.",
                 )
 
+        def begin(identity: DeviceIdentity) -> None:
+            log.begin(identity, clock.wall())
+
         def digests() -> dict[str, str]:
             return {"board": log.identity.digest[:16] if log.identity else "", "config": header["config"][:16]}
 
@@ -367,7 +370,7 @@ def acquire(
         else:
             try:
                 evidence = Evidence(prepared.arrival)
-                ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, log.begin, "park", unchecked)
+                ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, begin, "park", unchecked)
                 drift = evidence.drift()
             except (Exception, SystemExit):
                 if log.identity is not None:
@@ -408,17 +411,18 @@ def drive_poses(
     clock: Clock,
     evidence: Evidence,
     check: Callable[[DeviceIdentity], None] = lambda identity: None,
-    begin: Callable[[DeviceIdentity, float], None] = lambda identity, at: None,
+    begin: Callable[[DeviceIdentity], None] = lambda identity: None,
     when_stopped: WhenStopped = "hold",
     unchecked: bool = True,
 ) -> tuple[Ending, DeviceIdentity]:
     """Open device and tracker, ask whether the arm may be moved, and measure.
 
-    ``check`` may refuse the device; ``begin`` is called (with the time, unix s) when nothing may refuse the run any
-    more; ``when_stopped`` is what the arm does when somebody asks for the end.
+    ``check`` may refuse the device; ``begin`` is called when nothing may refuse the run any more; ``when_stopped`` is
+    what the arm does when somebody asks for the end.
     """
     device, settings, scheduler, progress = prepared.device, prepared.settings, prepared.scheduler, log.progress
-    monitor = TrackerMonitor(prepared.bench, clock)
+    tracker, bodies = prepared.bench.tracker(), prepared.bench.settings.bodies
+    monitor = TrackerMonitor(tracker, clock, settings.settle, bodies, settings.lost.park)
     with closing(monitor, device):
         identity = open_device(device, clock)
         check(identity)
@@ -450,7 +454,7 @@ def drive_poses(
         before = talk.asked_to_stop()
         if not talk.may_energise(start) or (talk.asked_to_stop() and not before):
             raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-        begin(identity, clock.wall())
+        begin(identity)
         gate = MotionGate(monitor, clock, settings.lost, talk.asked_to_stop, talk.waits)
         run = AcquisitionRun(
             drive, identity, scheduler, gate, log, evidence, lambda p: talk.report(p, len(scheduler.ids)), when_stopped

@@ -17,14 +17,13 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.devices.clock import Clock
-from armcal.devices.live import REPEATED, TrackerFrame, frames_of, refused_by
+from armcal.devices.live import REPEATED, Tracker, TrackerFrame, frames_of, refused_by
 from armcal.diagnose.data import FITS, MISSES, MUCH_BETTER
 from armcal.measure.rests import deviations_of_mean, judged, mean_pose
 from armcal.problem.rigid_alignment import rigid_fit, spread_of
 
 from armcal_bench.bench import (
     ArrivalSettings,
-    Bench,
     BodySettings,
     LostSettings,
     SettleSettings,
@@ -40,6 +39,7 @@ _MOST_FRAMES = 20_000
 _GAP = 0.25  # A part of the window that may pass without a usable frame
 _SLACK_S = 1e-9
 _LONGEST_STAND_S, _FEWEST = 30.0, 4
+_WELL_S = 0.1  # A tracker whose last frame was usable and came so lately is well
 _LEAST_RATE = 1e-7  # m/s: what is rounded more coarsely than its noise has no deviation
 
 
@@ -73,26 +73,62 @@ def pose_of(record: Mapping[str, Any]) -> Array:
     return pose
 
 
-class Settling:
-    """Judges by frames whether the arm stands. See ``armcal.measure.rests.judged`` for what that means."""
+class TrackerMonitor:
+    """Judges by frames whether the tracker is well, and whether the arm stands (see ``armcal.measure.rests.judged``).
 
-    def __init__(self, settings: SettleSettings, bodies: BodySettings) -> None:
-        self._settings = settings
-        self._bodies = bodies
+    A base body that stands still may be out of sight for ``longest_s`` while the arm moves.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        clock: Clock,
+        settings: SettleSettings,
+        bodies: BodySettings,
+        longest_s: float = float("inf"),
+    ) -> None:
+        self._tracker, self._clock, self._settings, self._bodies = tracker, clock, settings, bodies
         # base_T_target of a base body that stands still scatters as if it moved: its noise is in the mean as well
         self._scattered = bodies.model_copy(update={"base_motion": "moving"})
-        self._frames: deque[tuple[TrackerFrame, bool]] = deque(maxlen=_MOST_FRAMES)
+        self._frames: deque[tuple[TrackerFrame, bool]] = deque(maxlen=_MOST_FRAMES)  # and whether it is like the last
         self._last: TrackerFrame | None = None
         self._begun = -np.inf
+        self._longest = longest_s if bodies.base_motion == "still" else 0.0
+        self._usable_at = clock.now()
+        self._base_at: float | None = None  # when the base was seen last
+        self._why = ""
+        self._refused: Mapping[str, int] = {}
+        self._refused_before: Mapping[str, int] = {}
 
-    def begin(self, now: float) -> None:
-        self._begun = now
-        self._frames.clear()
+    def open(self) -> None:
+        self._tracker.open(self._clock)
 
-    def feed(self, frames: Iterable[TrackerFrame]) -> None:
+    def close(self) -> None:
+        self._tracker.close()
+
+    def look(self) -> None:
+        self.feed(frames_of(self._tracker), refused_by(self._tracker))
+
+    def feed(self, frames: Iterable[TrackerFrame], refused: Mapping[str, int]) -> None:
+        self._refused = dict(refused)
         for frame in frames:
-            self._frames.append((frame, repeats(frame, self._last, self._bodies)))
+            again = repeats(frame, self._last, self._bodies)
+            self._frames.append((frame, again))
             self._last = frame
+            unseen = base_fault(frame, self._bodies)
+            if not unseen:
+                self._base_at = frame.arrived
+            elif self._base_at is not None and frame.arrived - self._base_at < self._longest:
+                unseen = ""
+            elif self._base_at is not None:
+                self._usable_at = min(self._usable_at, self._base_at)
+            unseen = tool_fault(frame, self._bodies) or unseen
+            self._why = f"body lost: {unseen}" if unseen else ""
+            if not unseen and again:
+                self._why = "frozen: each frame is like the one before"
+            if not self._why:
+                self._usable_at = frame.arrived
+                self._refused_before = self._refused
         last = self._frames[-1][0].arrived if self._frames else 0.0
         oldest = last - self._settings.window
         if np.isfinite(self._begun):
@@ -100,9 +136,29 @@ class Settling:
         while self._frames and self._frames[0][0].arrived <= oldest:
             self._frames.popleft()
 
-    def state(self, now: float) -> Settled | str:
-        """Where it stands now (s, by the bench's clock), or why it is not known to stand: a sentence."""
-        window = self._settings.window
+    def trouble(self) -> tuple[float, str]:
+        """Seconds since the last usable frame, and why there was none since; (0, "") if all is well."""
+        since = self._clock.now() - self._usable_at
+        if since < _WELL_S and not self._why and self._last is not None:
+            return 0.0, ""
+        risen = {reason: count - self._refused_before.get(reason, 0) for reason, count in self._refused.items()}
+        worst = max(risen, key=lambda reason: risen[reason], default="")
+        silent = "silent: no frame comes"
+        if worst and risen[worst] > 0:
+            silent = f"silent: what comes cannot be read ({risen[worst]} times: {worst})"
+            if worst == REPEATED:
+                silent = "frozen: the same frame comes again and again"
+        return max(since, 0.0), self._why or silent
+
+    def begin(self) -> None:
+        """The arm was commanded to stand just now: frames that have come already were seen before that."""
+        self.look()
+        self._begun = self._clock.now()
+        self._frames.clear()
+
+    def settled(self) -> Settled | str:
+        """Where the arm stands now, or why it is not known to stand: a sentence."""
+        now, window = self._clock.now(), self._settings.window
         start = now - window
         left = self._begun + self._settings.wait - start
         if left > _SLACK_S:
@@ -153,7 +209,6 @@ def drift_of(times: Array, poses: Array) -> Stand | None:
     return Stand(mean, rates, np.maximum(sds, _LEAST_RATE))
 
 
-_WELL_S = 0.1  # A tracker whose last frame was usable and came so lately is well
 _SAID_EVERY_S = 60.0
 
 
@@ -184,84 +239,6 @@ class Waits:
 
 def duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
-
-
-class TrackerHealth:
-    """Whether frames are usable; a base body that stands still may be out of sight for ``longest_s``."""
-
-    def __init__(self, bodies: BodySettings, begun: float, longest_s: float = float("inf")) -> None:
-        self._bodies, self._longest = bodies, longest_s if bodies.base_motion == "still" else 0.0
-        self._usable_at = begun
-        self._last: TrackerFrame | None = None
-        self._base_at: float | None = None  # when the base was seen last
-        self._why = ""
-        self._refused: Mapping[str, int] = {}
-        self._refused_before: Mapping[str, int] = {}
-
-    def feed(self, frames: Iterable[TrackerFrame], refused: Mapping[str, int]) -> None:
-        self._refused = dict(refused)
-        for frame in frames:
-            unseen = base_fault(frame, self._bodies)
-            if not unseen:
-                self._base_at = frame.arrived
-            elif self._base_at is not None and frame.arrived - self._base_at < self._longest:
-                unseen = ""
-            elif self._base_at is not None:
-                self._usable_at = min(self._usable_at, self._base_at)
-            unseen = tool_fault(frame, self._bodies) or unseen
-            self._why = f"body lost: {unseen}" if unseen else ""
-            if not unseen and repeats(frame, self._last, self._bodies):
-                self._why = "frozen: each frame is like the one before"
-            self._last = frame
-            if not self._why:
-                self._usable_at = frame.arrived
-                self._refused_before = self._refused
-
-    def trouble(self, now: float) -> tuple[float, str]:
-        """Seconds since the last usable frame, and why there was none since; (0, "") if all is well."""
-        since = now - self._usable_at
-        if since < _WELL_S and not self._why and self._last is not None:
-            return 0.0, ""
-        risen = {reason: count - self._refused_before.get(reason, 0) for reason, count in self._refused.items()}
-        worst = max(risen, key=lambda reason: risen[reason], default="")
-        silent = "silent: no frame comes"
-        if worst and risen[worst] > 0:
-            silent = f"silent: what comes cannot be read ({risen[worst]} times: {worst})"
-            if worst == REPEATED:
-                silent = "frozen: the same frame comes again and again"
-        return max(since, 0.0), self._why or silent
-
-
-class TrackerMonitor:
-    def __init__(self, bench: Bench, clock: Clock) -> None:
-        self._clock, self._tracker, bodies = clock, bench.tracker(), bench.settings.bodies
-        self._settling = Settling(bench.settings.acquisition.settle, bodies)
-        self._health = TrackerHealth(bodies, clock.now(), bench.settings.acquisition.lost.park)
-
-    def open(self) -> None:
-        self._tracker.open(self._clock)
-
-    def look(self) -> None:
-        frames = frames_of(self._tracker)
-        self._health.feed(frames, refused_by(self._tracker))
-        self._settling.feed(frames)
-
-    def trouble(self) -> tuple[float, str]:
-        return self._health.trouble(self._clock.now())
-
-    def begin(self) -> None:
-        """The arm was commanded to stand just now: frames that have come already were seen before that."""
-        self.look()
-        self._settling.begin(self._clock.now())
-
-    def settled(self) -> Settled | str:
-        return self._settling.state(self._clock.now())
-
-    def stand(self) -> Stand | None:
-        return self._settling.stand()
-
-    def close(self) -> None:
-        self._tracker.close()
 
 
 class StopRequested(Exception):  # noqa: N818 - no error: somebody or something wants the run to end

@@ -532,14 +532,16 @@ class TestTracker:
     @pytest.mark.slow
     def test_frames_from_before_are_not_taken_for_frames_of_now(self, run: BenchRun) -> None:
         with run.simulated() as clock:
-            monitor = TrackerMonitor(Bench.of(run.experiment), clock)
+            bench = Bench.of(run.experiment)
+            own = bench.settings
+            monitor = TrackerMonitor(bench.tracker(), clock, own.acquisition.settle, own.bodies)
             monitor.open()
             try:
                 clock.sleep(0.5)
                 monitor.begin()
                 clock.sleep(0.001)
                 monitor.look()
-                assert len(monitor._settling._frames) <= 1
+                assert len(monitor._frames) <= 1
             finally:
                 monitor.close()
 
