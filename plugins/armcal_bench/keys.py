@@ -14,7 +14,7 @@ from armcal.io.lines import LineCutter
 
 _LONGEST = 1024
 END, QUIT = "q", "quit"
-_NAME = "g"
+_NAME, _ERASE = "g", "\x7f\b"
 SERVO_KEYS: Mapping[str, str] = {
     **dict.fromkeys(("\x1b[A", "\x1bOA", "+"), "+1"),
     **dict.fromkeys(("\x1b[B", "\x1bOB", "-"), "-1"),
@@ -56,7 +56,8 @@ class OperatorInput:
             elif self.ended and self._has_part:
                 self._cut(b"\n")
             else:
-                self._pressed = ""  # an escape with nothing after it is no key
+                if not self._is_naming:
+                    self._pressed = ""  # an escape with nothing after it is no key
                 return self._at_end if self.ended else None
         return self._words.popleft()
 
@@ -86,8 +87,13 @@ class OperatorInput:
         text, self._pressed = self._pressed + text, ""
         while text:
             if self._is_naming:
-                name, end, text = text.partition("\n")
-                self._is_naming = not end
+                line, end, rest = text.partition("\n")
+                if not end:
+                    self._pressed = text
+                    return
+                self._is_naming, text, name = False, rest, ""
+                for key in line:  # typed before the terminal had its own mode again
+                    name = name[:-1] if key in _ERASE else name + key
                 if name.strip():
                     self._words.append(f"{_NAME} {name.strip()}")
                 continue

@@ -117,9 +117,7 @@ def test_keys_of_a_terminal_which_is_left_as_it_was(tmp_path: Path, arm: GuidedA
     )
     try:
         expect(leader, b"q ends")
-        os.write(leader, b"g")
-        time.sleep(0.2)
-        os.write(leader, b"frond\x7ft/hole_0\n")
+        os.write(leader, b"gfrond\x7ft/hole_0\n")
         expect(leader, b"the arm touches front/hole_0.")
         time.sleep(0.2)
         os.write(leader, b"\n")
