@@ -269,7 +269,7 @@ def _driven(
 def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForecast) -> None:
     rests = sum(isinstance(step, Rest) for step in forecast.steps)
     console.line(
-        f"{len(prepared.plan)} poses in about {duration(forecast.seconds)}; the joints turn "
+        f"{len(prepared.scheduler.ids)} poses in about {duration(forecast.seconds)}; the joints turn "
         f"{np.rad2deg(forecast.travel):.0f} deg in all; {rests} rest{'s' * (rests != 1)}, "
         f"{duration(forecast.resting)} together."
     )
@@ -279,7 +279,7 @@ def _show_forecast(console: Console, prepared: Prepared, forecast: ScheduleForec
     for step in forecast.steps:
         if isinstance(step, LeaveOut):
             console.line(f"left out: {step.why}.")
-    for row in prepared.plan.set_aside:
+    for row in prepared.set_aside:
         console.warn(f"row {row.row} of the plan, pose {row.record_id}, is set aside and not driven: {row.reason}")
 
 
@@ -322,13 +322,13 @@ def _show_dry_run(console: Console, prepared: Prepared) -> None:
     except InputError as fault:
         unchecked = str(fault)
     content = {
-        "poses": len(prepared.plan),
+        "poses": len(prepared.scheduler.ids),
         "seconds": forecast.seconds,
         "travel_deg": float(np.rad2deg(forecast.travel)),
         "resting_s": forecast.resting,
         "hottest": dict(zip(joints, forecast.hottest.tolist(), strict=True)),
         "left_out": [step.why for step in forecast.steps if isinstance(step, LeaveOut)],
-        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+        "set_aside": {row.record_id: row.reason for row in prepared.set_aside},
         "hazards": [hazard.content for hazard in hazards],
         "unchecked": unchecked,
     }

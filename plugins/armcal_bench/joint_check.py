@@ -15,7 +15,6 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
-from armcal.base.dataset import Dataset
 from armcal.base.poses import NO_TURN
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, MeasuringDevice, measured_angles, open_device
@@ -416,8 +415,8 @@ def check_joints(experiment: Experiment, talk: Conversation) -> JointCheck:
         def prepare(poses: Mapping[str, Mapping[str, float]]) -> Prepared:
             for name, pose in poses.items():
                 commanded[name] = np.array([{**park, **pose}[joint] for joint in joints])
-            angles, plan = np.array(list(commanded.values())), Dataset(tuple(poses), {})
-            return of_poses(bench, own, device, plan, angles, np.zeros_like(angles), limits, base)
+            angles = np.array(list(commanded.values()))
+            return of_poses(bench, own, device, tuple(poses), angles, np.zeros_like(angles), limits, base)
 
         turned_ones = turned_a_little(prepare, park, turns, talk, clock)
         at = clock.wall()

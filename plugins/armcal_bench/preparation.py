@@ -11,7 +11,7 @@ from armcal.arm.assembly import Arm
 from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.arrays import Array, Mask
-from armcal.base.dataset import Dataset
+from armcal.base.dataset import SetAside
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice, standing_at
 from armcal.errors import ConfigError, DataError, Location
@@ -145,11 +145,11 @@ class Prepared:
     bench: Bench
     settings: AcquisitionSettings
     device: JointDevice
-    plan: Dataset  # joint commands and the plan's ids, in its order
     scheduler: Scheduler  # over the angles that the device can set nearest to them; with the planner and the heat model
     arrival: Arrival  # whether the arm stands where it was commanded to
     judge: HazardJudge  # of what is dangerous in the first motions and the last
-    warnings: tuple[str, ...]  # of limits beyond the arm model's own
+    set_aside: tuple[SetAside, ...] = ()  # rows of the plan that are not driven
+    warnings: tuple[str, ...] = ()  # of limits beyond the arm model's own
 
 
 def prepare(experiment: Experiment, plan: Path) -> Prepared:
@@ -191,7 +191,7 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
     # from which side each joint is to come; 0 where the plan does not say
     sides = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
     approaches = np.nan_to_num(np.array(sides).T.reshape(len(commands), -1))
-    prepared = of_poses(bench, settings, device, commands, np.array(poses), approaches, limits, park)
+    prepared = of_poses(bench, settings, device, commands.ids, np.array(poses), approaches, limits, park)
     planner = prepared.scheduler.planner
     for row, pose in enumerate(poses):
         if not planner.allowed(pose):
@@ -199,14 +199,15 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             refuse(row, f"pose {commands.ids[row]} is too near to something.", hint)
     check_park(experiment, planner, prepared.scheduler.model, park, device.joint_names)
     planned = experiment.settings.plan.limits if experiment.settings.plan else {}
-    return replace(prepared, warnings=stated_beyond(experiment, {**planned, **settings.limits}))
+    warnings = stated_beyond(experiment, {**planned, **settings.limits})
+    return replace(prepared, set_aside=tuple(commands.set_aside), warnings=warnings)
 
 
 def of_poses(
     bench: Bench,
     settings: AcquisitionSettings,
     device: JointDevice,
-    plan: Dataset,
+    ids: tuple[str, ...],
     poses: Array,
     approaches: Array,
     limits: Array,
@@ -223,10 +224,10 @@ def of_poses(
     planner = PathPlanner(check, settable, known, settings.path_step, settings.seed)
     heat = heat_of(experiment, settings, arm)
     rate, capture = float(np.deg2rad(settings.rate_deg_per_s)), settings.settle.wait + settings.settle.window + 0.5
-    scheduler = Scheduler(poses, plan.ids, approaches, park, planner, heat, rate, capture)
+    scheduler = Scheduler(poses, ids, approaches, park, planner, heat, rate, capture)
     judge = HazardJudge(device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
-    return Prepared(bench, settings, device, plan, scheduler, arrival, judge, ())
+    return Prepared(bench, settings, device, scheduler, arrival, judge)
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:

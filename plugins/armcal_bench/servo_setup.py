@@ -12,7 +12,6 @@ import numpy as np
 from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.arrays import Array
-from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, Compliance, Duration, InputPath, Length, Settings, UnitOf
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
@@ -227,7 +226,7 @@ class Setup:
         ends = np.array([self.ranges[joint] for joint in joints])
         standing = device.standing(self.base)
         park = np.array([standing[joint] for joint in joints])
-        return of_poses(self.bench, self.acquisition, device, Dataset(tuple(poses), {}), angles, approaches, ends, park)
+        return of_poses(self.bench, self.acquisition, device, tuple(poses), angles, approaches, ends, park)
 
     def _pose(self, other: Mapping[str, float]) -> Array:
         return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])

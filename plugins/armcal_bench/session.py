@@ -380,10 +380,10 @@ def acquire(
         summary = {
             "how": ending.how,
             "why": ending.sentence,
-            "poses": len(prepared.plan),
+            "poses": len(ids),
             "measured": len(log.progress.measured),
             "left_out": dict(log.progress.left_out),
-            "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
+            "set_aside": {row.record_id: row.reason for row in prepared.set_aside},
             "times": "written" if run_log.in_order(log.progress) else "left out: the clock was set back during the run",
             "gives_way": drift,
             "board": log.identity.name if log.identity else "",
