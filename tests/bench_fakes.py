@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from armcal.devices.device import DeviceIdentity, DeviceLostError, DeviceState
-from armcal_bench.acquisition.run_log import Progress
-from armcal_bench.acquisition.tracker_monitor import Settled
+from armcal_bench.run_log import Progress
+from armcal_bench.tracker_monitor import Settled
 
 COUNT_RAD = 0.0093
 

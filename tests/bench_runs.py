@@ -20,9 +20,9 @@ from armcal.errors import ArmcalError, InputError
 from armcal.io.journal import KeptJournal, has_journal
 from armcal.plugins import use_plugins
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.preparation import Prepared, prepare
-from armcal_bench.acquisition.run_log import Progress, dataset_of, progress_of
-from armcal_bench.acquisition.session import Outcome, RunOptions, acquire
+from armcal_bench.preparation import Prepared, prepare
+from armcal_bench.run_log import Progress, Start, dataset_of, progress_of
+from armcal_bench.session import Conversation, Outcome, acquire
 
 from tests.simulated_lines.line_world import BOARD, CLOCK
 from tests.simulated_lines.socket_clock import SimulatedClock
@@ -133,10 +133,9 @@ class BenchRun:
     def acquire(self, asked: Callable[[], bool] = lambda: False, prepared: Prepared | None = None) -> Outcome:
         """Begin or go on."""
         there = has_journal(self.out)
-        options = RunOptions(
-            self.out, "resume" if there else "anew", asked, lambda start: True, lambda progress: None, True
-        )
-        return acquire(prepared or self.prepared(), self.plan, options)
+        talk = Conversation(asked, lambda start: True)
+        start: Start = "resume" if there else "anew"
+        return acquire(prepared or self.prepared(), self.plan, self.out, start, talk, unchecked=True)
 
     def acquire_until_killed(self, sleeps: int) -> bool:
         """In a child that is killed (SIGKILL) when it sleeps for the n-th time; False if it ended before."""

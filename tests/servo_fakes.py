@@ -13,7 +13,7 @@ from armcal.config.servo_file import load_servo_file
 from armcal.devices.device import DeviceIdentity, DeviceLostError, DeviceState
 from armcal.run.experiment import Experiment
 from armcal_bench.bench import Bench
-from armcal_bench.servo.setup import Setup
+from armcal_bench.servo_setup import Setup
 
 from tests.bench_fakes import FakeClock
 

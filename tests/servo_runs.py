@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from armcal.io.journal import JOURNAL, Journal
 from armcal.run.experiment import Experiment
-from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import evaluated, measure
-from armcal_bench.servo.setup import Conversation, Setup
+from armcal_bench.servo_session import evaluated, measure
+from armcal_bench.servo_setup import Record, Setup
+from armcal_bench.session import Conversation
 
 from tests.bench_runs import BenchRun, _in_child, _wait, free_port, overrides_for
 from tests.servo_fakes import CONFIGS

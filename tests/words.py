@@ -49,8 +49,6 @@ PHRASES = {
     r"\bnimbleness\b": "dexterity",
     r"\bmix-ups?\b": "permuted or flipped axes",
 }
-KEYS = {("record.py", "told")}
-"""Names that are keys of files which users keep."""
 READ = ("*.py", "*.md", "*.j2", "*.yaml")
 
 
@@ -58,7 +56,7 @@ def names(file: Path) -> Iterator[tuple[int, str, str]]:
     """Line, name and what to say, for each refused name in a module."""
     with file.open("rb") as stream:
         for token in tokenize.tokenize(stream.readline):
-            if token.type == tokenize.NAME and token.string in NAMES and (file.name, token.string) not in KEYS:
+            if token.type == tokenize.NAME and token.string in NAMES:
                 yield token.start[0], token.string, NAMES[token.string]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from armcal.arm.assembly import Arm, only_arm
 from armcal.base.arrays import Array
 from armcal.base.poses import PoseSettings
-from armcal.base.settings import InputPath, Settings
+from armcal.base.settings import Angle, Duration, InputPath, Length, Settings, Temperature, Torque
 from armcal.config.system import build_component
 from armcal.config.validate import validate
 from armcal.devices.clock import Clock, RealClock
@@ -24,8 +24,66 @@ from armcal.plugins import refuse
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
 
-from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.recording.postures import RecordingSettings
+from armcal_bench.postures import RecordingSettings
+
+
+class ServoHeatSettings(Settings):
+    """How a servo heats: its winding soon, its case slowly."""
+
+    continuous: Annotated[Torque, Field(gt=0)]  # held for ever, it leads to the limit
+    winding_time: Annotated[Duration, Field(gt=0)] = 60.0
+    case_time: Annotated[Duration, Field(gt=0)] = 900.0
+    winding_share: Annotated[float, Field(ge=0, le=1)] = 0.3  # of the heat; the rest is the case's
+    budget: Annotated[float, Field(gt=0, le=1)] = 0.5  # of the limit; 0.5 is safe where each number is wrong by 30 %
+
+
+class SettleSettings(Settings):
+    """When the arm stands."""
+
+    wait: Duration = 0.5  # before the window
+    window: Duration = 1.0  # whose mean is taken
+    spread: Length = 0.0005  # by which its halves differ at most
+    longest: Duration = 15.0  # after which the pose is left
+    frames: Annotated[int, Field(ge=2)] = 10
+
+
+class ArrivalSettings(Settings):
+    """How far the arm may be from where it was commanded to be, by distances and turns between measured poses.
+
+    More is no error of the model but a servo that failed, stalls or lost a tooth, or a body that slipped.
+    """
+
+    astray: Annotated[Length, Field(gt=0)] = 0.1
+    astray_turned: Annotated[Angle, Field(gt=0)] = 0.45
+    in_a_row: Annotated[int, Field(ge=1)] = 3  # after which the arm parks and the run ends
+
+
+class LostSettings(Settings):
+    """For how long a tracker is silent, frozen or blind until the arm holds, and parks."""
+
+    hold: Duration = 0.5
+    park: Duration = 30.0
+
+
+class AcquisitionSettings(Settings):
+    """How the plan is driven."""
+
+    rate_deg_per_s: Annotated[float, Field(gt=0, le=180)] = 20.0
+    period: Duration = 0.02
+    limits: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)  # else those of the plan, else the model's
+    park: dict[str, Angle] = Field(default_factory=dict)  # where the arm is safe, cool and left alone; others at zero
+    path_step: Angle = 0.0175
+    settle: SettleSettings = Field(default_factory=SettleSettings)
+    arrival: ArrivalSettings = Field(default_factory=ArrivalSettings)
+    lost: LostSettings = Field(default_factory=LostSettings)
+    heat: dict[str, ServoHeatSettings] = Field(default_factory=dict)  # without it no heat is reckoned with
+    silence: Duration = 1.0  # of the host, after which a board that can parks the arm by itself
+    at_end: Literal["release", "hold"] = "release"
+    between_joints: Duration = 0.5  # between the first pulses of two joints
+    temperature: Temperature | None = None  # of the room; it is written with the data
+    angles: Literal["commanded", "measured"] = "commanded"  # that the dataset has; the others stand beside them
+    seed: Annotated[int, Field(ge=0)] = 0
+
 
 _LEAST_OUTLIER_M = 2e-4
 _NAMES_SHOWN = 8
@@ -37,15 +95,11 @@ Name = Annotated[str, Field(min_length=1, max_length=100)]
 
 
 class BodySettings(Settings):
-    """The bodies by the tracker's own names, and what is known about where they sit.
-
-    With a ``moving`` base each frame is taken in the base body's own pose of that frame; with a ``still`` one the base
-    body's poses of all frames of a capture are averaged first.
-    """
+    """The bodies by the tracker's own names, and what is known about where they sit."""
 
     tool: Name = "tool"  # the body on the tool
     base: Name = NONE  # the body that stands still with the arm's base; ``none`` where the tracker's world does
-    base_motion: Literal["moving", "still"] = "moving"
+    base_motion: Literal["moving", "still"] = "moving"  # of a still one the poses of a capture are averaged
     # where the base body (or the tracker's world, without one) is in the arm's base frame
     base_T_reference: PoseSettings = Field(default_factory=PoseSettings)
     tool_body_T_target: PoseSettings = Field(default_factory=PoseSettings)  # where the measured target is on the tool
@@ -63,8 +117,6 @@ class BodySettings(Settings):
 
 
 class Capture(NamedTuple):
-    """Some frames, in the arm's base frame."""
-
     # ``base_T_target`` (N x 4 x 4, m), NaN where a frame does not show it; the rotation, too, of a tracker of positions
     poses: Array
     faults: tuple[str, ...]  # why a frame does not show it, a sentence; empty where it does (N)
@@ -129,14 +181,12 @@ def repeats(frame: TrackerFrame, before: TrackerFrame | None, settings: BodySett
 
 
 def _stacked(frames: Sequence[TrackerFrame], name: str) -> Array:
-    """``world_T_body`` of each frame, NaN where it is not seen (N x 4 x 4)."""
     nothing = np.full((4, 4), np.nan)
     poses = [frame.bodies.get(name) for frame in frames]
     return np.array([nothing if pose is None else pose for pose in poses]).reshape(-1, 4, 4)
 
 
 def _reference(frames: Sequence[TrackerFrame], settings: BodySettings) -> Array:
-    """``world_T_reference`` of each frame (N x 4 x 4)."""
     if not settings.has_base:
         return np.tile(np.eye(4), (len(frames), 1, 1))
     stacked = _stacked(frames, settings.base)
@@ -153,13 +203,9 @@ SECTION = "bench"
 
 
 class BenchSettings(Settings):
-    """Components keep their own settings under ``type``.
+    """Components keep their own settings under ``type``."""
 
-    ``bodies`` says which of the tracker's bodies is what. ``simulated`` is the folder of a simulated bench (that of
-    ``simulator``) that stands in for device, tracker and joint readings; without it they are the real ones.
-    """
-
-    simulated: InputPath | None = None
+    simulated: InputPath | None = None  # the folder of a simulated bench that stands in for the real parts
     link: dict[str, Any] | None = None
     device: dict[str, Any] | None = None
     tracker: dict[str, Any] | None = None
@@ -191,14 +237,11 @@ def closing(*parts: Any) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Bench:
-    """What an experiment's bench is made of; parts are built when they are asked for, and opened by who uses them."""
-
     experiment: Experiment
     settings: BenchSettings
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
-        """The bench of an experiment; ConfigError where none is configured, or it is refused."""
         if experiment.settings.bench is None:
             hint = "Say what moves and measures the arm: bench: {link: ..., device: ..., tracker: ...}."
             raise ConfigError("found no bench.", where=experiment.source.where((SECTION,)), hint=hint)
@@ -206,13 +249,11 @@ class Bench:
 
     @property
     def arm(self) -> Arm:
-        """The only arm; ConfigError where there are several."""
         where, hint = self.experiment.source.where(("arms",)), "Configure each arm's bench on its own."
         return only_arm(self.experiment.system.arms, "a bench moves a single arm", hint, where)
 
     @cached_property
     def simulation(self) -> RunningBench | None:
-        """The simulated bench that stands in for the parts; None where they are real."""
         if self.settings.simulated is None:
             return None
         simulator: SimulatedBench = self._built("simulator", kind="bench")
@@ -221,7 +262,6 @@ class Bench:
 
     @contextmanager
     def clock(self) -> Iterator[Clock]:
-        """The machine's clock, or the simulated bench's, which ends with it."""
         if self.simulation is None:
             yield RealClock()
             return
@@ -238,12 +278,10 @@ class Bench:
         return built if self.simulation is None else self.simulation.device(built, isinstance(link, GuardedLink))
 
     def tracker(self) -> Tracker:
-        """The tracker; see ``device``."""
         built: Tracker = self._built("tracker")
         return built if self.simulation is None else self.simulation.tracker(built)
 
     def joints(self) -> JointStream:
-        """The stream of joint readings; see ``device``."""
         built: JointStream = self._built("joints")
         return built if self.simulation is None else self.simulation.joints(built)
 

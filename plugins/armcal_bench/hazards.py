@@ -1,15 +1,157 @@
-"""What is dangerous in the first motion of an arm and in its last: first pulses, the pose it stands in, letting go."""
+"""What endangers an arm: servos that heat, first pulses, the pose it stands in, letting go."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from armcal.arm.assembly import Arm, holding_function
+from armcal.arm.joints import unknown_joint
+from armcal.arm.statics import Environment
 from armcal.base.arrays import Array
+from armcal.devices.clock import Clock
+from scipy.optimize import brentq
 
-from armcal_bench.acquisition.heat import Torques
+from armcal_bench.bench import ServoHeatSettings
+
+NEVER = float("inf")
+COOLED_TO = 0.5  # Of the budget: a rest goes on to here, so that the servos do not rest before every pose
+_SAME_HEAT = 1e-4
+_TIMES_OVER = 20.0
+_RESOLUTION_S = 0.01
+
+
+Torques = Callable[[Array], Array]  # Holding torques (joints, N m) at joint angles (joints, rad)
+
+
+@dataclass(frozen=True)
+class HeatModel:
+    """All servos, by joint. Heat is a fraction of a servo's limit: 0 at rest for long, 1 at its limit.
+
+    What a servo loses goes with the square of its current, and the current with its torque. It warms the winding, which
+    is quick, and the case, which is slow; each has a share of the heat and a time constant:
+    ``thermal_state' = ((torque / continuous)^2 - thermal_state) / time``, and heat is the sum of share times warmth.
+    """
+
+    continuous: Array  # N m (joints; infinite where a servo is not reckoned with)
+    times: Array  # s (joints x 2: winding, case)
+    shares: Array  # of the heat (joints x 2)
+    budget: Array  # the heat that each may come to (joints)
+    torques: Torques  # that heat them
+
+    @classmethod
+    def of(cls, joints: Sequence[str], settings: Mapping[str, ServoHeatSettings], torques: Torques) -> Self:
+        if fault := unknown_joint(settings, joints):
+            raise ValueError(fault)
+        servos = [settings.get(joint) for joint in joints]
+        usual = ServoHeatSettings.si(continuous=1.0)
+        return cls(
+            np.array([s.continuous if s else NEVER for s in servos]),
+            np.array([[(s or usual).winding_time, (s or usual).case_time] for s in servos]),
+            np.array([[(s or usual).winding_share, 1 - (s or usual).winding_share] for s in servos]),
+            np.array([s.budget if s else NEVER for s in servos]),
+            torques,
+        )
+
+    @property
+    def cold(self) -> Array:
+        return np.zeros(self.times.shape)
+
+    def heat(self, thermal_state: Array) -> Array:
+        return np.asarray((self.shares * thermal_state).sum(axis=1))
+
+    def steady(self, torque: Array) -> Array:
+        """The warmth of all parts (joints x 1) that a torque (joints, N m) leads to in the end."""
+        return np.asarray((torque / self.continuous) ** 2)[:, None]
+
+    def after(self, thermal_state: Array, torque: Array, seconds: float) -> Array:
+        steady = self.steady(torque)
+        return np.asarray(steady + (thermal_state - steady) * np.exp(-seconds / self.times))
+
+    def over(self, thermal_state: Array) -> bool:
+        return bool(np.any(self.heat(thermal_state) > self.budget))
+
+    def too_hot_for_ever(self, torque: Array, part: float = 1.0) -> int | None:
+        """The first servo that stays above a part of its budget under a torque (joints, N m); None if none does."""
+        over = self.steady(torque)[:, 0] > part * self.budget
+        return int(np.argmax(over)) if over.any() else None
+
+    def cooled_in(self, thermal_state: Array, torque: Array, limits: Array) -> float:
+        """Seconds of holding a torque until no heat is above its limit (joints); infinite if it never comes so."""
+
+        def excess(seconds: float) -> float:
+            return float(np.max(self.heat(self.after(thermal_state, torque, seconds)) - limits))
+
+        if excess(0.0) <= 0:
+            return 0.0
+        longest = _TIMES_OVER * float(self.times.max())
+        return NEVER if excess(longest) > 0 else float(brentq(excess, 0.0, longest, xtol=1e-6)) + _RESOLUTION_S
+
+
+def holding_torques(arm: Arm, environment: Environment) -> Torques:
+    function = holding_function(arm, environment.gravity, environment.payload_mass, environment.payload_com)
+
+    def torques(pose: Array) -> Array:
+        return np.asarray(function(pose).full()).ravel()
+
+    return torques
+
+
+class ThermalLimit(Exception):  # noqa: N818 - no error: the servos are let rest
+    """A servo has come to its budget before its time."""
+
+
+class ThermalState:
+    """How warm the servos are, followed from cold on, or from where another run left it."""
+
+    def __init__(self, model: HeatModel, joints: Sequence[str], clock: Clock) -> None:
+        self.model, self._joints, self._clock = model, joints, clock
+        self.warmth = self.model.cold  # of winding and case (joints x 2)
+        self._since = clock.now()
+
+    def go_on(self, before: Mapping[str, Sequence[float]], standing: Mapping[str, float], seconds: float) -> None:
+        """From another run's warmth (winding and case, by joint), after which joints stood at angles (rad) for so long.
+
+        Joints that are not among these angles hang free, and cool.
+        """
+        self.warmth = np.array([before.get(joint, (0.0, 0.0)) for joint in self._joints], dtype=float)
+        held = np.array([joint in standing for joint in self._joints])
+        self.warmth = self.model.after(self.warmth, self.model.torques(self._pose(standing)) * held, max(seconds, 0.0))
+
+    def pass_to_now(self, angles: Mapping[str, float]) -> None:
+        now = self._clock.now()
+        self.warmth = self.model.after(self.warmth, self.model.torques(self._pose(angles)), now - self._since)
+        self._since = now
+
+    @property
+    def by_joint(self) -> dict[str, list[float]]:
+        return dict(zip(self._joints, self.warmth.tolist(), strict=True))
+
+    def check(self) -> None:
+        if self.model.over(self.warmth):
+            raise ThermalLimit(f"the servo of {self._hottest[0]} has come to its budget")
+
+    def hotter_than(self, warmth: Array, angles: Mapping[str, float]) -> bool:
+        """Whether a servo is hotter than in a thermal state (joints x 2), and still cools at these angles (rad)."""
+        steady = np.repeat(self.model.steady(self.model.torques(self._pose(angles))), 2, axis=1)
+        least = np.maximum(self.model.heat(warmth), self.model.heat(steady))
+        return bool(np.any(self.model.heat(self.warmth) > least + _SAME_HEAT))
+
+    @property
+    def hottest(self) -> str:
+        joint, share = self._hottest
+        return f"that of {joint} is at {100 * share:.0f} % of its budget"
+
+    @property
+    def _hottest(self) -> tuple[str, float]:
+        shares = self.model.heat(self.warmth) / self.model.budget
+        return self._joints[int(np.argmax(shares))], float(np.max(shares))
+
+    def _pose(self, angles: Mapping[str, float]) -> Array:
+        return np.array([angles.get(joint, 0.0) for joint in self._joints])
+
 
 _GEARS_HOLD = 0.05  # N m: under less than this the gears of a small servo stand without pulses; more turns them
 _FALL_STEP = math.radians(2.0)
@@ -19,8 +161,6 @@ _BEYOND = math.radians(0.5)  # A board's counts lie half a degree apart
 
 @dataclass(frozen=True)
 class Hazard:
-    """The worst of its kind."""
-
     kind: str  # ``first_pulse``, ``limits`` or ``drop``
     joint: str  # that turns
     amount: float  # how far (rad)
@@ -33,8 +173,6 @@ class Hazard:
 
 @dataclass(frozen=True)
 class FirstMotion:
-    """What is about to move."""
-
     free: tuple[str, ...]  # joints that hang free and get their first pulses
     powered: tuple[str, ...]  # joints that have pulses
     hazards: tuple[Hazard, ...]  # of the motion, the worst of each kind
@@ -43,14 +181,9 @@ class FirstMotion:
 
 @dataclass(frozen=True, eq=False)
 class HazardJudge:
-    """Judges an arm's motions before they begin."""
-
     joints: tuple[str, ...]  # in the arm's order
-    moved: tuple[str, ...]  # those that have servos
     limits: Array  # of the joints (joints x 2, rad)
-    torques: (
-        Torques  # of the load on each joint at joint angles (joints, N m); it turns a limp joint the way of its sign
-    )
+    torques: Torques  # of the load on each joint (joints, N m); it turns a limp joint the way of its sign
     rest: Array  # where the arm parks, or its base pose (joints, rad)
 
     def first_motion(
@@ -61,23 +194,15 @@ class HazardJudge:
         releases: bool,
         measured: Collection[str] = (),
     ) -> FirstMotion:
-        """A run's start and its end.
-
-        Args:
-            standing: the angles (rad) of the joints that have pulses.
-            first: the angles that the others' first pulses ask for, where that is not where the arm rests.
-            releases: whether servos are let go where the arm rests.
-            measured: joints whose servos know where they stand.
-        """
-        powered = tuple(joint for joint in self.moved if joint in standing)
-        limp = [joint for joint in self.moved if joint not in standing]
+        """A run's start and its end; limp joints get the ``first`` angles, or those of the rest pose."""
+        powered = tuple(joint for joint in self.joints if joint in standing)
+        limp = [joint for joint in self.joints if joint not in standing]
         free = tuple(joint for joint in limp if joint not in measured)
         hazards = [self._jump(free, first), self._outside(standing), self._drop() if releases else None]
         there = tuple(hazard for hazard in hazards if hazard is not None)
         return FirstMotion(free, powered, there, tuple(joint for joint in limp if joint in measured))
 
     def _jump(self, free: Sequence[str], first: Mapping[str, float]) -> Hazard | None:
-        """A limp joint hangs anywhere: at an end of its range, or as it falls from where the arm rests."""
         goals = [first.get(joint, float(self.rest[i])) for i, joint in enumerate(self.joints)]
         jumps = [
             max((abs(goals[i] - end), end, i) for end in (*self.limits[i], self._fallen[i]))
@@ -95,7 +220,6 @@ class HazardJudge:
         )
 
     def _outside(self, standing: Mapping[str, float]) -> Hazard | None:
-        """A joint whose pulses ask for an angle beyond its limits."""
         rows = [(i, standing[joint], *self.limits[i]) for i, joint in enumerate(self.joints) if joint in standing]
         amount, i, at = max(((max(low - at, at - high), i, at) for i, at, low, high in rows), default=(0.0, 0, 0.0))
         if amount <= _BEYOND:
@@ -110,7 +234,6 @@ class HazardJudge:
         )
 
     def _drop(self) -> Hazard | None:
-        """How far the arm falls from where it rests, once its servos are let go."""
         fallen = self._fallen
         i = int(np.argmax(np.abs(fallen - self.rest)))
         amount, torque = abs(float(fallen[i] - self.rest[i])), abs(float(self.torques(self.rest)[i]))

@@ -15,7 +15,6 @@ import numpy as np
 from armcal.arm.assembly import Arm
 from armcal.arm.servo import TOOTH_DEG, teeth_text
 from armcal.base.arrays import Array
-from armcal.base.dataset import Dataset
 from armcal.base.poses import NO_TURN
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceIdentity, MeasuringDevice, measured_angles, open_device
@@ -24,16 +23,13 @@ from armcal.errors import ConfigError, InputError
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
-from armcal_bench.acquisition.drive import PathPlanner
-from armcal_bench.acquisition.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
-from armcal_bench.acquisition.run_log import Log, Progress, measured_by
-from armcal_bench.acquisition.session import Ending, opened, ready_run
-from armcal_bench.acquisition.tracker_monitor import Evidence, StopRequested, pose_of
 from armcal_bench.bench import SECTION, Bench, closing
-from armcal_bench.measured_frame import FEWEST, FrameMistake
-from armcal_bench.servo.record import BEGUN, POSE
-from armcal_bench.servo.setup import ANYWHERE, Conversation
-from armcal_bench.servo.tracked_body import (
+from armcal_bench.drive import PathPlanner
+from armcal_bench.preparation import Prepared, check_park, clearance_of, heat_of, of_poses, run_limits
+from armcal_bench.run_log import Log, Progress, measured_by
+from armcal_bench.servo_setup import ANYWHERE, BEGUN, POSE
+from armcal_bench.session import Conversation, Ending, drive_poses, known_poses
+from armcal_bench.tracked_body import (
     BODY,
     TABLES,
     Body,
@@ -45,6 +41,7 @@ from armcal_bench.servo.tracked_body import (
     turn_of_point,
     twist_angles,
 )
+from armcal_bench.tracker_monitor import FEWEST, Evidence, FrameMistake, StopRequested, pose_of
 
 _LEVER_M = 0.1
 _STILL = math.radians(1.5)
@@ -59,8 +56,6 @@ _SURE = 40.0
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a joint did."""
-
     joint: str  # that was commanded
     kind: str  # ``right``, ``reversed``, ``gain``, ``another``, ``still`` or ``unclear``
     sentence: str  # what was seen
@@ -70,11 +65,7 @@ class Verdict:
 
 
 def noted(record: WiringRecord, verdicts: Sequence[Verdict], seen: Mapping[str, Any]) -> None:
-    """Write down as checked the joints that turned as commanded, and as no other joint did.
-
-    Raises:
-        InputError: it cannot be written; what was seen is said.
-    """
+    """Write down as checked the joints that turned as commanded, and as no other joint did."""
     right = [verdict.joint for verdict in verdicts if verdict.kind == "right" and not verdict.other]
     try:
         record.note(right, [verdict.joint for verdict in verdicts if verdict.joint not in right], seen)
@@ -86,10 +77,7 @@ def noted(record: WiringRecord, verdicts: Sequence[Verdict], seen: Mapping[str, 
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """What was seen when a joint was commanded to turn (rad): the tool's pose before and after (4 x 4, base frame).
-
-    Rotations may be NaN.
-    """
+    """The tool's pose before and after a joint was commanded to turn (rad; 4 x 4, base frame; rotations may be NaN)."""
 
     joint: str
     commanded: float
@@ -114,8 +102,6 @@ class Move:
 
 @dataclass(frozen=True)
 class _Wiring:
-    """Which joint each command moves, and with which sign."""
-
     moves: Mapping[str, str]
     signs: Mapping[str, int]
 
@@ -124,21 +110,15 @@ class _Wiring:
         return sum(a != b for a, b in self.moves.items()) + sum(sign < 0 for sign in self.signs.values())
 
     def pose(self, base: Mapping[str, float]) -> dict[str, float]:
-        """Where the joints stand then (rad)."""
         return {self.moves[joint]: self.signs[joint] * angle for joint, angle in base.items()}
 
 
 def judged(moves: Sequence[Move], base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
-    """What each joint did, by all that was seen together.
+    """What each joint did, by all that was seen together, from a base pose as commanded (rad).
 
     A swapped or reversed servo stands elsewhere in the base pose too, so that the axes of the joints after it are not
     where the model has them: each wiring with a few faults is tried, and the one that explains all moves with the
     fewest faults is taken.
-
-    Args:
-        moves: one of each joint that was tried.
-        base: the angles of all joints that the pulses command (rad).
-        nominal: the model.
     """
     seen = [move for move in moves if not move.is_little]
     scored = sorted((_score(wiring, seen, base, nominal), i, wiring) for i, wiring in enumerate(_wirings(tuple(base))))
@@ -218,16 +198,6 @@ def _wirings(joints: tuple[str, ...]) -> Iterator[_Wiring]:
                         yield _Wiring(moves, {joint: -1 if joint in turned else 1 for joint in joints})
 
 
-def answered(joint: str, commanded: float, ask: Callable[[str], str]) -> Verdict:
-    size = f"{math.degrees(commanded):+.0f} deg"
-    answer = ask(
-        f"{joint} was commanded to turn by {size}. y: it did, r: the other way, o: another joint did, n: nothing moved"
-    )
-    kinds = {"y": ("right", commanded), "r": ("reversed", -commanded), "o": ("another", math.nan), "n": ("still", 0.0)}
-    kind, turned = kinds.get(answer, ("unclear", math.nan))
-    return _verdict(kind, joint, commanded, turned, "another joint" if kind == "another" else "")
-
-
 def swapped(verdicts: list[Verdict]) -> list[str]:
     went = {v.joint: v.other for v in verdicts if v.kind == "another"}
     return [
@@ -267,7 +237,7 @@ def _verdict(kind: str, joint: str, commanded: float, turned: float, other: str 
             "Check its servo's type and its table's angles; then calibrate it.",
         ),
         "another": (
-            f"{joint} was commanded {size}, and {other} turned{'' if math.isnan(turned) else f' by {seen}'}.",
+            f"{joint} was commanded {size}, and {other} turned by {seen}.",
             f"Give {joint} the channel of {other} in the servo file, or change the plugs.",
         ),
         "still": (f"{joint} was commanded {size} and did not move.", "Check its plug, its channel and its supply."),
@@ -281,11 +251,9 @@ def _verdict(kind: str, joint: str, commanded: float, turned: float, other: str 
 
 
 _TURNS_DEG = (12.0, -12.0, 6.0, -6.0)
-BASE = "base"
 IN_BASE = "the arm is commanded to hold its base pose"
 _MODEL_SD_M, _ZERO_SD, _TARGET_SD_M = 0.004, math.radians(15.0), 0.01
 """Of the pose of an arm that sags and is not as drawn; of its zeros; of where the tracker's body sits."""
-"""Of the splines of hobby and bus servos."""
 _REST_DEG, _MOST_TEETH = 5.0, 12
 """The standard deviation of a zero that was set by hand; a horn is a tooth off in one case of ten, two in a hundred."""
 _UNREMARKABLE_DEG, _PLAUSIBLE = 10.0, 0.05
@@ -328,7 +296,6 @@ class Zero:
         return len(self.teeth) == 1
 
     def sentence(self, joint: str) -> str:
-        """What it looks like; empty where that is a zero set by hand."""
         if self.is_sure and not self.teeth[0][0] and not self.is_far:
             return ""
         amount = f"{math.degrees(self.value):+.1f} +- {math.degrees(self.sd):.1f} deg"
@@ -343,8 +310,6 @@ class Zero:
 
 @dataclass(frozen=True)
 class JointCheck:
-    """What each joint did, and how far its zero is off (empty where not all turned as commanded)."""
-
     verdicts: Sequence[Verdict]
     zeros: Mapping[str, Zero]
 
@@ -361,8 +326,6 @@ class JointCheck:
 
 @dataclass(frozen=True)
 class Turned:
-    """What was seen of joints that turned a little."""
-
     identity: DeviceIdentity
     moves: Sequence[Move]
     unseen: Sequence[Verdict]  # of joints that were not seen to stand
@@ -370,12 +333,7 @@ class Turned:
     mistake: FrameMistake | None  # of the tracker's frame
 
     def judged(self, base: Mapping[str, float], nominal: RigidArm) -> list[Verdict]:
-        """What each joint did, from a pose (rad by joint).
-
-        Raises:
-            InputError: not every joint turned as commanded, and the tracker's frame is another one than expected:
-                reversed servos resemble a left-handed one.
-        """
+        """What each joint did; InputError where one seems to turn wrongly in another frame than expected."""
         verdicts = [*(judged(self.moves, base, nominal) if self.moves else []), *self.unseen]
         if self.mistake is None or all(verdict.kind == "right" for verdict in verdicts):
             return verdicts
@@ -384,33 +342,30 @@ class Turned:
         raise InputError(f"{self.mistake.sentence}.", hint=hint)
 
 
-def between(poses: Mapping[str, Mapping[str, float]]) -> dict[str, Mapping[str, float]]:
-    """Poses by joint, each after the one from which that joint turns."""
-    pairs = [((f"{BASE} {joint}", dict[str, float]()), (joint, turned)) for joint, turned in poses.items()]
-    return {name: pose for pair in pairs for name, pose in pair}
-
-
-def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conversation, clock: Clock) -> Turned:
-    """Drive the poses of ``between`` as a measuring run; ``turns`` are those of the joints (rad).
-
-    Raises:
-        InputError: the board or the tracker is refused, or the tracker gives other units than expected.
-        StopRequested: it was stopped before its end.
-    """
-    log, options, ids = Log(), talk.options(), prepared.scheduler.ids
+def turned_a_little(
+    prepare: Callable[[Mapping[str, Mapping[str, float]]], Prepared],
+    base: Mapping[str, float],
+    turns: Mapping[str, float],
+    talk: Conversation,
+    clock: Clock,
+) -> Turned:
+    """Turn joints one by one from the base pose, as a measuring run that is prepared for the poses by their ids."""
+    poses: dict[str, dict[str, float]] = {}
+    for joint, turn in turns.items():
+        poses |= {f"base {joint}": {}, joint: {joint: base[joint] + turn}}
+    prepared, log, ids = prepare(poses), Log(), tuple(poses)
     evidence = Evidence(prepared.arrival, lambda mistake: mistake.frame.is_mirrored, 2 * FEWEST)
-    with opened(prepared, options, clock, lambda identity: None) as (gate, identity):
-        run = ready_run(prepared, options, log, gate, identity, evidence)
-        ending, seen = run.run(), run.known
+    ending, identity = drive_poses(prepared, talk, log, clock, evidence)
     if ending.how == "refused":
         raise InputError(f"{ending.sentence}.", hint="Correct that, and check again.")
     check_ended(ending, log.progress, len(ids))
+    seen = known_poses(ids, log.progress)
     measured = {ids[place]: pose for place, pose in seen.items()}
     moves, unseen = [], []
     for joint, turn in turns.items():
-        missing = next((name for name in (f"{BASE} {joint}", joint) if name not in measured), None)
+        missing = next((name for name in (f"base {joint}", joint) if name not in measured), None)
         if missing is None:
-            moves.append(Move(joint, turn, measured[f"{BASE} {joint}"], measured[joint]))
+            moves.append(Move(joint, turn, measured[f"base {joint}"], measured[joint]))
         else:
             why = log.progress.left_out.get(missing, "it was not measured")
             unseen.append(Verdict(joint, "unclear", f"{joint}: it was not seen to stand ({why})."))
@@ -418,11 +373,6 @@ def turned_a_little(prepared: Prepared, turns: Mapping[str, float], talk: Conver
 
 
 def check_ended(ending: Ending, progress: Progress, total: int) -> None:
-    """Whether a run through so many poses came to its end.
-
-    Raises:
-        StopRequested: it did not.
-    """
     is_over = len(progress.measured) + len(progress.left_out) >= total
     if ending.how == "held":
         raise StopRequested(ending.sentence, ending.arm)
@@ -434,11 +384,6 @@ def check_joints(experiment: Experiment, talk: Conversation) -> JointCheck:
     """Turn each joint of servos that know where they stand a little, and write down which are checked.
 
     A zero that is far off makes limits and clearances wrong by as much: such a joint does not count as checked.
-
-    Raises:
-        ConfigError: the device does not know where its joints stand, or the arm stands beyond a limit or too near to
-            something.
-        InputError: it cannot be written down. See ``turned_a_little`` for more.
     """
     bench = Bench.of(experiment)
     own = bench.settings.acquisition.model_copy(update={"arrival": ANYWHERE})
@@ -465,70 +410,52 @@ def check_joints(experiment: Experiment, talk: Conversation) -> JointCheck:
                 if planner.within(turned) and planner.clear(base, turned):
                     turns[joint] = turn
                     break
-        steps = between({joint: {joint: park[joint] + turn} for joint, turn in turns.items()})
-        angles = np.array([[{**park, **pose}[joint] for joint in joints] for pose in steps.values()])
-        plan = Dataset(tuple(steps), {})
-        prepared = of_poses(bench, own, device, plan, angles, np.zeros_like(angles), limits, base)
-        turned_ones = turned_a_little(prepared, turns, talk, clock)
+        commanded: dict[str, Array] = {}
+
+        def prepare(poses: Mapping[str, Mapping[str, float]]) -> Prepared:
+            for name, pose in poses.items():
+                commanded[name] = np.array([{**park, **pose}[joint] for joint in joints])
+            angles = np.array(list(commanded.values()))
+            return of_poses(bench, own, device, tuple(poses), angles, np.zeros_like(angles), limits, base)
+
+        turned_ones = turned_a_little(prepare, park, turns, talk, clock)
         at = clock.wall()
-    check = _judged(experiment, arm, park, dict(zip(steps, angles, strict=True)), turned_ones, nominal)
-    far = {joint for joint, zero in check.zeros.items() if zero.is_far}
-    counted = [replace(v, kind="unclear") if v.joint in far else v for v in check.verdicts]
-    seen = {"adapter": turned_ones.identity.adapter, "by": "tracker", "at": at}
-    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
-    return check
-
-
-def _judged(
-    experiment: Experiment,
-    arm: Arm,
-    base: Mapping[str, float],
-    commanded: Mapping[str, Array],
-    turned: Turned,
-    nominal: RigidArm,
-) -> JointCheck:
-    joints = list(base)
-    verdicts = turned.judged(base, nominal)
-    zeros: dict[str, Zero] = {}
-    if len(turned.moves) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
-        names = list(turned.measured)
-        poses = np.array([commanded[name] for name in names]), np.array([turned.measured[name] for name in names])
-        scope, stated = measured_by(experiment)[0], experiment.parameters
-        axes = [f"{scope}.target_{axis}" for axis in "xyz"]
-        target = np.array([stated[name].nominal[0] if name in stated.names else 0.0 for name in axes])
-        zeros = _zeros(experiment, arm, joints, poses, target)
+    verdicts, zeros = turned_ones.judged(park, nominal), dict[str, Zero]()
+    if len(turned_ones.moves) == len(joints) and {verdict.kind for verdict in verdicts} <= {"right", "unclear"}:
+        zeros = _zeros(experiment, arm, commanded, turned_ones.measured)
         # a zero that is far off turns the axes of the joints after it away from the model's
-        verdicts = turned.judged({joint: base[joint] + zeros[joint].value for joint in joints}, nominal)
+        verdicts = turned_ones.judged({joint: park[joint] + zeros[joint].value for joint in joints}, nominal)
     verdicts = [replace(verdict, mend=_MENDS.get(verdict.kind, verdict.mend)) for verdict in verdicts]
-    named = {verdict.joint for verdict in verdicts}
     for joint in joints:
-        if joint not in named:
+        if joint not in turns:
             sentence = f"{joint} was not measured: there is nowhere to turn to."
             verdicts.append(Verdict(joint, "unclear", sentence, "Begin from a pose with more room about it."))
-    return JointCheck(verdicts, zeros if all(verdict.kind == "right" for verdict in verdicts) else {})
+    if any(verdict.kind != "right" for verdict in verdicts):
+        zeros = {}
+    counted = [replace(v, kind="unclear") if v.joint in zeros and zeros[v.joint].is_far else v for v in verdicts]
+    seen = {"adapter": turned_ones.identity.adapter, "by": "tracker", "at": at}
+    noted(WiringRecord.of_config(experiment.source, here), counted, seen)
+    return JointCheck(verdicts, zeros)
 
 
 def _zeros(
-    experiment: Experiment, arm: Arm, joints: list[str], poses: tuple[Array, Array], target: Array
+    experiment: Experiment, arm: Arm, commanded: Mapping[str, Array], measured: Mapping[str, Array]
 ) -> dict[str, Zero]:
-    """How much the joints' angles are to be enlarged by.
-
-    Args:
-        poses: commanded (N x joints, rad), and measured (N x 4 x 4).
-        target: as stated (3, m, tool frame).
-    """
-    commanded, measured = poses
-    numbers = {joint: arm.joint_names.index(joint) + 1 for joint in joints}
-    names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers.values()]
+    """How much the joints' angles (rad, by pose, in the arm's order) are to be enlarged by."""
+    scope, stated = measured_by(experiment)[0], experiment.parameters
+    axes = [f"{scope}.target_{axis}" for axis in "xyz"]
+    target = tuple(float(stated[name].nominal[0]) if name in stated.names else 0.0 for name in axes)
+    poses, count = np.array(list(measured.values())), len(measured)
+    angles = dict(zip(arm.commanded, np.array([commanded[name] for name in measured]).T, strict=True))
+    numbers = [arm.joint_names.index(joint) + 1 for joint in arm.commanded]
+    names = [f"{arm.name}.{TABLES}.zero{number}" for number in numbers]
     places = [f"{BODY}.seat_{axis}" for axis in "xyz"]
     free = {**dict.fromkeys(names, _ZERO_SD), **dict.fromkeys(places, _TARGET_SD_M)}
-    by: By = "position" if np.isnan(measured[:, :3, :3]).any() else "pose"
-    count = len(measured)
-    angles = dict(zip(joints, commanded.T, strict=True))
+    by: By = "position" if np.isnan(poses[:, :3, :3]).any() else "pose"
     noise = np.full(count, _MODEL_SD_M / _LEVER_M), np.full(count, _MODEL_SD_M)
-    seen = body_dataset(arm.name, angles, measured, noise)
-    body = Body((arm.name,), by, NO_TURN, tuple(target.tolist()))
-    fit = BodyFit(experiment, arm, Corrections({}, list(numbers.values()), ()), body, free, seen)
+    seen = body_dataset(arm.name, angles, poses, noise)
+    body = Body((arm.name,), by, NO_TURN, target)
+    fit = BodyFit(experiment, arm, Corrections({}, numbers, ()), body, free, seen)
     fit.fit(seen, np.ones(count))
     sds = fit.deviations(names).tolist()
-    return {joint: Zero(fit.value(name), sd) for joint, name, sd in zip(joints, names, sds, strict=True)}
+    return {joint: Zero(fit.value(name), sd) for joint, name, sd in zip(arm.commanded, names, sds, strict=True)}

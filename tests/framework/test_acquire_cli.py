@@ -16,7 +16,7 @@ import pytest
 from armcal.cli.main import cli
 from armcal.devices.device import DeviceRefusedError
 from armcal.errors import InputError
-from armcal_bench.acquisition.session import RunOptions, acquire
+from armcal_bench.session import Conversation, acquire
 from click.testing import CliRunner, Result
 
 from tests.bench_runs import CONFIG, BenchRun, overrides_for, positions, write_plan
@@ -42,6 +42,9 @@ def run(tmp_path: Path) -> BenchRun:
     return BenchRun(tmp_path, SETS)
 
 
+QUIET = Conversation(lambda: False, lambda start: True)
+
+
 def tracker_port(run: BenchRun) -> int:
     return int(run.experiment.settings.bench["tracker"]["port"])  # type: ignore[index]
 
@@ -49,13 +52,6 @@ def tracker_port(run: BenchRun) -> int:
 def there(run: BenchRun) -> tuple[str, ...]:
     """What a command needs to meet the simulated bench."""
     return (*overrides_for(run.bench), f"bench.tracker.port={tracker_port(run)}")
-
-
-def quiet_options(run: BenchRun, **changes: object) -> RunOptions:
-    answers = {"asked_to_end": lambda: False, "may_energise": lambda start: True}
-    options = {"folder": run.out, "start": "anew", "unchecked": True, "on_progress": lambda progress: None, **answers}
-    options |= changes
-    return RunOptions(**options)  # type: ignore[arg-type]
 
 
 class TestDryRun:
@@ -163,11 +159,11 @@ class TestRefusedBeforeAnythingMoves:
     def test_a_folder_with_a_run_unless_it_is_resumed_and_one_without_if_it_is(self, run: BenchRun, plan: Path) -> None:
         prepared = run.prepared()
         with pytest.raises(InputError, match="no run to resume"), run.simulated():
-            acquire(prepared, run.plan, quiet_options(run, start="resume"))
+            acquire(prepared, run.plan, run.out, "resume", QUIET, unchecked=True)
         with run.simulated():
             run.acquire(lambda: True)
             with pytest.raises(InputError, match="--resume"):
-                acquire(prepared, run.plan, quiet_options(run))
+                acquire(prepared, run.plan, run.out, "anew", QUIET, unchecked=True)
             run.plan.write_text(run.plan.read_text().replace("40,", "41,"))
             with pytest.raises(InputError, match="another plan"):
                 run.acquire()

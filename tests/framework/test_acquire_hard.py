@@ -22,13 +22,12 @@ from armcal.errors import ArmcalError, InputError
 from armcal.io.journal import Journal, JournalFailedError, JournalFullError
 from armcal.io.json_server import JsonServer
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.drive import Drive, PathPlanner
-from armcal_bench.acquisition.preparation import Rest
-from armcal_bench.acquisition.session import RunOptions, acquire
-from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings, ServoHeatSettings
-from armcal_bench.acquisition.tracker_monitor import Arrival, TrackerMonitor
-from armcal_bench.bench import Bench
+from armcal_bench.bench import AcquisitionSettings, ArrivalSettings, Bench, ServoHeatSettings
+from armcal_bench.drive import Drive, PathPlanner
 from armcal_bench.hazards import FirstMotion
+from armcal_bench.preparation import Rest
+from armcal_bench.session import Conversation, acquire
+from armcal_bench.tracker_monitor import Arrival, TrackerMonitor
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
@@ -136,8 +135,8 @@ class TestHostThatStalls:
                 return True
 
             clock.ask({"fault": {"kind": "seen"}})
-            options = RunOptions(run.out, "resume", never, thinks, lambda progress: None, unchecked=True)
-            assert acquire(run.prepared(), run.plan, options).ending.how == "done"
+            talk = Conversation(never, thinks)
+            assert acquire(run.prepared(), run.plan, run.out, "resume", talk, unchecked=True).ending.how == "done"
             assert clock.ask({"state": True})["offences"] == {}
 
 
@@ -205,13 +204,13 @@ class TestJournalThatFails:
         run = holding
         write_plan(run.plan, POSES[:2])
 
-        def told(progress: Any) -> None:
+        def told(progress: Any, total: int) -> None:
             raise fault
 
         with run.simulated() as clock:
-            options = RunOptions(run.out, "anew", never, lambda start: True, told, unchecked=True)
+            talk = Conversation(never, lambda start: True, told)
             with pytest.raises(type(fault)):
-                acquire(run.prepared(), run.plan, options)
+                acquire(run.prepared(), run.plan, run.out, "anew", talk, unchecked=True)
             state = clock.ask({"state": True})
             assert is_parked(state) and state["offences"] == {}
             assert run.acquire().ending.how == "done"
@@ -250,9 +249,9 @@ class TestAskedToEnd:
             return True
 
         with run.simulated() as clock:
-            options = RunOptions(run.out, "anew", lambda: answered[0], answer, lambda progress: None, unchecked=True)
+            talk = Conversation(lambda: answered[0], answer)
             with pytest.raises(InputError, match="nothing was moved"):
-                acquire(run.prepared(), run.plan, options)
+                acquire(run.prepared(), run.plan, run.out, "anew", talk, unchecked=True)
             assert clock.ask({"state": True})["events"] == {}
 
 
@@ -324,8 +323,8 @@ class TestBoard:
                 run.acquire()
         other = BenchRun(tmp_path, (*SETS, "bench.acquisition.settle.window_s=0.9"))
         with other.simulated():
-            options = RunOptions(other.out, "anew", never, lambda start: True, lambda progress: None, unchecked=True)
-            assert acquire(other.prepared(), other.plan, options).ending.how == "done"
+            talk = Conversation(never, lambda start: True)
+            assert acquire(other.prepared(), other.plan, other.out, "anew", talk, unchecked=True).ending.how == "done"
 
     def test_pulses_that_are_not_those_that_were_told_are_not_measured(self) -> None:
         """Another program, or a chip that lost its supply and nothing else."""
@@ -428,10 +427,10 @@ class TestNobodyFeelsWhereTheArmIs:
                 return len(seen)
 
             seen: list[Any] = []
-            options = RunOptions(run.out, "anew", asked, lambda start: True, seen.append, unchecked=True)
+            talk = Conversation(asked, lambda start: True, lambda progress, total: seen.append(progress))
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(TrackerMonitor, "settled", slipped)
-                outcome = acquire(run.prepared(), run.plan, options)
+                outcome = acquire(run.prepared(), run.plan, run.out, "anew", talk, unchecked=True)
             assert outcome.ending.how == "parked" and "3 times in a row" in outcome.ending.sentence
             assert is_let_go(clock.ask({"state": True}))
 
@@ -533,14 +532,16 @@ class TestTracker:
     @pytest.mark.slow
     def test_frames_from_before_are_not_taken_for_frames_of_now(self, run: BenchRun) -> None:
         with run.simulated() as clock:
-            monitor = TrackerMonitor(Bench.of(run.experiment), clock)
+            bench = Bench.of(run.experiment)
+            own = bench.settings
+            monitor = TrackerMonitor(bench.tracker(), clock, own.acquisition.settle, own.bodies)
             monitor.open()
             try:
                 clock.sleep(0.5)
                 monitor.begin()
                 clock.sleep(0.001)
                 monitor.look()
-                assert len(monitor._settling._frames) <= 1
+                assert len(monitor._frames) <= 1
             finally:
                 monitor.close()
 

@@ -8,13 +8,13 @@ from functools import partial
 import numpy as np
 import pytest
 from armcal.devices.device import DeviceError, DeviceIdentity, DeviceLostError, DeviceUnwellError
-from armcal_bench.acquisition.drive import Drive, PathPlanner
-from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.preparation import Scheduler
-from armcal_bench.acquisition.run_log import Progress
-from armcal_bench.acquisition.session import AcquisitionRun
-from armcal_bench.acquisition.settings import AcquisitionSettings, ServoHeatSettings
-from armcal_bench.acquisition.tracker_monitor import MotionGate
+from armcal_bench.bench import AcquisitionSettings, ServoHeatSettings
+from armcal_bench.drive import Drive, PathPlanner
+from armcal_bench.hazards import HeatModel
+from armcal_bench.preparation import Scheduler
+from armcal_bench.run_log import Progress
+from armcal_bench.session import AcquisitionRun
+from armcal_bench.tracker_monitor import MotionGate
 
 from tests.bench_fakes import COUNT_RAD, FakeClock, FakeDevice, FakeLog, FakeTrackerMonitor, KilledError, NoEvidence
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal_bench.acquisition.drive import PathPlanner, travel
-from armcal_bench.acquisition.heat import NEVER, HeatModel
-from armcal_bench.acquisition.preparation import LeaveOut, Measure, Rest, Scheduler, forecast_schedule
-from armcal_bench.acquisition.settings import ServoHeatSettings
+from armcal_bench.bench import ServoHeatSettings
+from armcal_bench.drive import PathPlanner, travel
+from armcal_bench.hazards import NEVER, HeatModel
+from armcal_bench.preparation import LeaveOut, Measure, Rest, Scheduler, forecast_schedule
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp

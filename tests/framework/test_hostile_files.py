@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from armcal.base.config_text import shown
 from armcal.cli.main import cli
-from armcal_bench.commands.common import QueuedOutput
+from armcal_bench.commands import QueuedOutput
 from armcal_export.c_code import in_comment
 from click.testing import CliRunner, Result
 from made_calibrations import written

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
-from armcal_bench.acquisition.drive import travel
-from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.preparation import (
+from armcal_bench.bench import ServoHeatSettings
+from armcal_bench.drive import travel
+from armcal_bench.hazards import HeatModel
+from armcal_bench.preparation import (
     LeaveOut,
     Measure,
     Rest,
@@ -20,7 +21,6 @@ from armcal_bench.acquisition.preparation import (
     forecast_schedule,
     prepare,
 )
-from armcal_bench.acquisition.settings import ServoHeatSettings
 from armcal_simulation.servos import ServoHeat, ServoJointSettings
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"

@@ -11,8 +11,8 @@ from armcal.base.arrays import Array
 from armcal.base.units import length_mistake
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.run.experiment import Experiment
-from armcal_bench.measured_frame import frame_mistake
-from armcal_bench.servo.tracked_body import RigidArm
+from armcal_bench.tracked_body import RigidArm
+from armcal_bench.tracker_monitor import frame_mistake
 from scipy.spatial.transform import Rotation
 
 from tests.servo_records import ElasticArm

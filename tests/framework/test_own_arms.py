@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from armcal_bench.acquisition.tracker_monitor import Waits
-from armcal_bench.servo.record import Record
+from armcal_bench.servo_setup import Record
+from armcal_bench.tracker_monitor import Waits
 
 from tests.own_arms import POST, POST_SERVOS, TOWER, TOWER_SERVOS, OwnArm, said_by
 from tests.simulated_lines.socket_clock import SimulatedClock

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from armcal_bench.acquisition.drive import PathPlanner, travel
+from armcal_bench.drive import PathPlanner, travel
 
 LIMITS = np.array([[-2.0, 2.0], [-2.0, 2.0]])
 

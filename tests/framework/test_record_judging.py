@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from armcal.run.experiment import Experiment
-from armcal_bench.recording.agreement import QuickFitter
+from armcal_bench.agreement import QuickFitter
 from recordings import DEMO, command, postures, recorded, still_lines
 
 

@@ -16,7 +16,7 @@ import yaml
 from armcal.cli.main import cli
 from armcal.errors import DataError
 from armcal.plugins import use_plugins
-from armcal_bench.servo.record import Record
+from armcal_bench.servo_setup import Record
 from click.testing import CliRunner
 
 from tests.bench_runs import AT_LINE, free_port, simulated_bench

@@ -17,7 +17,7 @@ from armcal.config.servo_file import (
     servo_file_text,
 )
 from armcal.errors import ConfigError
-from armcal_bench.servo.outputs import write_servo_file
+from armcal_bench.servo_fit import write_servo_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 from armcal.arm.servo import PulseClock, PulseTable
-from armcal_bench.servo.fit import outcome_of
-from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings
-from armcal_bench.servo.tracked_body import RigidArm
+from armcal_bench.servo_fit import outcome_of
+from armcal_bench.servo_setup import KnownServo, ServoCalibrationSettings
+from armcal_bench.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.own_arms import POST, _config
@@ -67,10 +67,10 @@ def angle_pulse(table, angle):
 
 def fitted(experiment, lines, zero="model"):
     (arm,) = experiment.system.arms.values()
-    known = [KnownServo("b", "only", STATED, KNOTS)]
+    known = [KnownServo("b", "only", STATED, CLOCK, KNOTS)]
     begun = {"kind": "begun", "servos": {}, "base": BASE}
     settings = ServoCalibrationSettings.si(zero=zero, sag="none", rotation_sd=1e-5)
-    return outcome_of([begun, *lines], known, {"only": CLOCK}, experiment, arm, settings)
+    return outcome_of([begun, *lines], known, experiment, arm, settings)
 
 
 def test_a_planted_table_and_lag_come_back(experiment) -> None:

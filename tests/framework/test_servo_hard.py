@@ -13,13 +13,13 @@ import yaml
 from armcal.config.servo_file import BoardSettings, ServoFile, load_servo_file
 from armcal.devices.device import DeviceError
 from armcal.errors import ArmcalError, DataError, InputError
-from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.heat import HeatModel, ThermalState
-from armcal_bench.acquisition.tracker_monitor import StopRequested
-from armcal_bench.servo.outputs import improved, write_servo_file
-from armcal_bench.servo.record import Record
-from armcal_bench.servo.session import evaluated, measure
-from armcal_bench.servo.setup import Conversation
+from armcal_bench.drive import Drive
+from armcal_bench.hazards import HeatModel, ThermalState
+from armcal_bench.servo_fit import improved, write_servo_file
+from armcal_bench.servo_session import evaluated, measure
+from armcal_bench.servo_setup import Record
+from armcal_bench.session import Conversation
+from armcal_bench.tracker_monitor import StopRequested
 
 from tests.bench_fakes import FakeClock
 from tests.framework.test_acquire_faults import faults
@@ -252,46 +252,6 @@ def test_guided_nothing_goes_beyond_the_range(tmp_path: Path, monkeypatch: Any) 
 
 
 class TestRecord:
-    def damaged(self, done: ServoRun, folder: Path, line: int, change: Callable[[dict[str, Any]], None]) -> Path:
-        rows = done.rows()
-        change(rows[line])
-        put_rows(folder, rows)
-        return folder
-
-    @pytest.mark.quick("at-None", "came-0", "counts-307.5", "counts-99999", "deviations-value9")
-    @pytest.mark.parametrize(
-        ("key", "value"),
-        [
-            ("joint", None),
-            ("counts", 307.5),
-            ("counts", 99999),
-            ("came", 0),
-            ("position", [0.1, 0.2]),
-            ("position", [0.1, float("nan"), 0.2]),
-            ("rotation", [[1, 0, 0], [0, 1, 0], [0, 0, 2]]),
-            ("rotation", [[1, 0, 0], [0, 1, 0]]),
-            ("rotation", "what"),
-            ("deviations", [None] * 5),
-            ("told", {"q1": "x"}),
-            ("told", None),
-            ("kind", "begun"),
-            ("kind", ["pose"]),
-            ("at", None),
-            ("warmth", {"q1": [1]}),
-        ],
-    )
-    def test_an_entry_that_says_something_else_is_refused_with_its_place(
-        self, done: ServoRun, tmp_path: Path, key: str, value: Any
-    ) -> None:
-        folder = self.damaged(done, tmp_path, 4, lambda row: row.update({key: value}))
-        with pytest.raises(DataError, match=r"journal.sqlite: entry 5: found a"):
-            Record(folder)
-
-    def test_so_is_one_of_which_a_part_is_gone(self, done: ServoRun, tmp_path: Path) -> None:
-        for key in ("joint", "counts", "came", "position", "rotation", "deviations", "told", "at"):
-            with pytest.raises(DataError, match=r"journal.sqlite: entry 5: found a"):
-                Record(self.damaged(done, tmp_path, 4, lambda row, key=key: row.pop(key)))  # type: ignore[misc]
-
     def test_without_its_beginning_nobody_knows_by_which_tables_it_was_measured(
         self, done: ServoRun, tmp_path: Path
     ) -> None:

@@ -11,9 +11,8 @@ from armcal.arm.servo import PulseClock, PulseTable
 from armcal.config.servo_file import load_servo_file
 from armcal.config.yaml_source import load_config
 from armcal.run.experiment import Experiment
-from armcal_bench.servo.fit import outcome_of
-from armcal_bench.servo.outputs import findings, improved, results, write_servo_file
-from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings
+from armcal_bench.servo_fit import findings, improved, outcome_of, results, write_servo_file
+from armcal_bench.servo_setup import KnownServo, ServoCalibrationSettings
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS
@@ -73,10 +72,8 @@ def record_of(arm, seen="rotation", noise_deg=0.01, joints=REACH, step=23):
 
 
 def evaluated(record, nominal, joints=REACH, **settings):
-    known = [KnownServo(joint, "front", STATED.servos[joint].table) for joint in joints]
-    return outcome_of(
-        record, known, {"front": CLOCK}, nominal.experiment, nominal.arm, ServoCalibrationSettings.si(**settings)
-    )
+    known = [KnownServo(joint, "front", STATED.servos[joint].table, CLOCK) for joint in joints]
+    return outcome_of(record, known, nominal.experiment, nominal.arm, ServoCalibrationSettings.si(**settings))
 
 
 def worst_us(outcome):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from armcal.run.experiment import Experiment
 from armcal_bench.joint_check import Move, judged, swapped
-from armcal_bench.servo.tracked_body import RigidArm
+from armcal_bench.tracked_body import RigidArm
 from scipy.spatial.transform import Rotation
 
 from tests.servo_fakes import CONFIGS
@@ -26,7 +26,7 @@ def arm():
 def test_axes_are_those_about_which_the_tool_turns(arm):
     pose = {"q1": 0.3, "q2": -0.4, "q3": 0.7, "q4": 0.5, "q5": -0.6, "q6": 0.2}
     for joint in arm.joints:
-        axis, origin = arm.axis(joint, pose)
+        axis, origin = arm.axes(pose)[joint]
         step = 1e-6
         moved = arm.tool({**pose, joint: pose[joint] + step}) @ np.linalg.inv(arm.tool(pose))
         assert Rotation.from_matrix(moved[:3, :3]).as_rotvec() / step == pytest.approx(axis, abs=1e-5)

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from armcal.devices.live import REPEATED, TrackerFrame
 from armcal.measure.rests import deviations_of_mean, mean_pose
-from armcal_bench.acquisition.settings import SettleSettings
-from armcal_bench.acquisition.tracker_monitor import Settled, Settling, TrackerHealth, drift_of
-from armcal_bench.bench import BodySettings
+from armcal_bench.bench import BodySettings, SettleSettings
+from armcal_bench.tracker_monitor import Settled, TrackerMonitor, drift_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+
+from tests.bench_fakes import FakeClock
 
 RATE = 60.0
 NOISE_M, NOISE_RAD = 5e-5, 3e-4
@@ -53,10 +54,40 @@ def frames(
     return found
 
 
+class NoFrames:
+    """A tracker that sends nothing by itself."""
+
+    def __init__(self) -> None:
+        self.refused: dict[str, int] = {}
+
+    def frames(self) -> list[TrackerFrame]:
+        return []
+
+
+class Watched(TrackerMonitor):
+    """A monitor that is given its frames."""
+
+    def __init__(self, rules: SettleSettings, bodies: BodySettings) -> None:
+        self.clock = FakeClock()
+        super().__init__(NoFrames(), self.clock, rules, bodies)  # type: ignore[arg-type]
+
+    def begin_at(self, now: float) -> None:
+        self.clock.time = now
+        self.begin()
+
+    def settled_at(self, now: float) -> Settled | str:
+        self.clock.time = now
+        return self.settled()
+
+    def trouble_at(self, now: float) -> tuple[float, str]:
+        self.clock.time = now
+        return self.trouble()
+
+
 def state(seen: Iterable[TrackerFrame], now: float, rules: SettleSettings = RULES, bodies: BodySettings = ONLY_TOOL):
-    settling = Settling(rules, bodies)
-    settling.feed(seen)
-    return settling.state(now)
+    watched = Watched(rules, bodies)
+    watched.feed(seen, {})
+    return watched.settled_at(now)
 
 
 def why(found: Settled | str) -> str:
@@ -136,10 +167,10 @@ def test_where_the_world_is_does_not_matter(seed: int, motion: str) -> None:
 
 def test_feeding_in_lumps_or_one_by_one_is_the_same() -> None:
     seen = frames(lambda t: at(0.3), 1.5)
-    one_by_one = Settling(RULES, BODIES)
+    one_by_one = Watched(RULES, BODIES)
     for frame in seen:
-        one_by_one.feed([frame])
-    found, expected = one_by_one.state(1.5), state(seen, 1.5, bodies=BODIES)
+        one_by_one.feed([frame], {})
+    found, expected = one_by_one.settled_at(1.5), state(seen, 1.5, bodies=BODIES)
     assert isinstance(found, Settled) and isinstance(expected, Settled)
     np.testing.assert_array_equal(found.base_T_target, expected.base_T_target)
 
@@ -193,12 +224,12 @@ def test_noise_that_lasts_counts_for_less(correlation: float) -> None:
 
 def test_what_came_before_the_arm_stood_does_not_count() -> None:
     seen = frames(lambda t: at(0.3), 4.0)
-    settling = Settling(SettleSettings.si(wait=0.5), ONLY_TOOL)
-    settling.feed(seen[:60])
-    settling.begin(1.0)
+    settling = Watched(SettleSettings.si(wait=0.5), ONLY_TOOL)
+    settling.feed(seen[:60], {})
+    settling.begin_at(1.0)
     for frame in seen[60:]:
-        settling.feed([frame])
-        found = settling.state(frame.arrived)
+        settling.feed([frame], {})
+        found = settling.settled_at(frame.arrived)
         assert isinstance(found, Settled) == (frame.arrived >= 2.5)
         if frame.arrived < 2.5:
             assert "too early" in why(found)
@@ -243,55 +274,55 @@ def test_positions_alone_settle_too() -> None:
 
 @pytest.mark.slow
 def test_memory_is_bounded() -> None:
-    settling = Settling(RULES, ONLY_TOOL)
+    settling = Watched(RULES, ONLY_TOOL)
     for frame in frames(lambda t: at(0.3), 60.0):
-        settling.feed([frame])
+        settling.feed([frame], {})
     assert len(settling._frames) <= RATE + 1
-    settling.begin(60.0)
+    settling.begin_at(60.0)
     for frame in frames(lambda t: at(0.3), 100.0):
-        settling.feed([frame])
+        settling.feed([frame], {})
     assert len(settling._frames) <= 30 * RATE + 1
 
 
-def health(seen: Iterable[TrackerFrame], refused: dict[str, int] | None = None) -> TrackerHealth:
-    found = TrackerHealth(BODIES, 0.0)
+def health(seen: Iterable[TrackerFrame], refused: dict[str, int] | None = None) -> Watched:
+    found = Watched(RULES, BODIES)
     found.feed(seen, refused or {})
     return found
 
 
 def test_the_health_of_a_tracker() -> None:
     seen = frames(lambda t: at(0.3), 2.0)
-    assert health(seen).trouble(2.0) == (0.0, "")
-    seconds, reason = health(seen).trouble(5.0)
+    assert health(seen).trouble_at(2.0) == (0.0, "")
+    seconds, reason = health(seen).trouble_at(5.0)
     assert seconds == pytest.approx(3.0, abs=0.02) and reason == "silent: no frame comes"
-    seconds, reason = health(without(seen, "base", 1.5, 2.0)).trouble(2.0)
+    seconds, reason = health(without(seen, "base", 1.5, 2.0)).trouble_at(2.0)
     assert seconds == pytest.approx(0.5, abs=0.02) and reason.startswith("body lost") and "'base'" in reason
     frozen = seen[:90] + [TrackerFrame(f.counter, f.arrived, None, seen[89].bodies) for f in seen[90:]]
-    seconds, reason = health(frozen).trouble(2.0)
+    seconds, reason = health(frozen).trouble_at(2.0)
     assert seconds == pytest.approx(0.5, abs=0.02) and reason.startswith("frozen")
-    assert health([]).trouble(0.7) == (0.7, "silent: no frame comes")
+    assert health([]).trouble_at(0.7) == (0.7, "silent: no frame comes")
 
 
 def test_what_was_refused_tells_why_a_tracker_is_silent() -> None:
     seen = frames(lambda t: at(0.3), 1.0)
     found = health(seen, {"not ASCII text": 5})
     found.feed([], {"not ASCII text": 5, REPEATED: 40})
-    assert found.trouble(2.0)[1].startswith("frozen")
+    assert found.trouble_at(2.0)[1].startswith("frozen")
     found.feed([], {"not ASCII text": 99, REPEATED: 40})
-    assert found.trouble(2.0)[1] == "silent: what comes cannot be read (94 times: not ASCII text)"
+    assert found.trouble_at(2.0)[1] == "silent: what comes cannot be read (94 times: not ASCII text)"
     found.feed([TrackerFrame(1000, 2.0, None, seen[0].bodies)], {"not ASCII text": 99, REPEATED: 40})
-    assert found.trouble(2.0) == (0.0, "")
+    assert found.trouble_at(2.0) == (0.0, "")
 
 
 def test_a_still_base_may_be_out_of_sight_once_it_was_seen() -> None:
     bodies = BodySettings(tool="tool", base="base", base_motion="still")
     seen = frames(lambda t: at(0.3), 2.0)
-    found = TrackerHealth(bodies, 0.0)
+    found = Watched(RULES, bodies)
     found.feed(without(seen, "base", 1.0, 2.0), {})
-    assert found.trouble(2.0) == (0.0, "")
-    unseen = TrackerHealth(bodies, 0.0)
+    assert found.trouble_at(2.0) == (0.0, "")
+    unseen = Watched(RULES, bodies)
     unseen.feed(without(seen, "base", 0.0, 2.0), {})
-    assert unseen.trouble(2.0)[1].startswith("body lost")
+    assert unseen.trouble_at(2.0)[1].startswith("body lost")
 
 
 def test_the_drift_of_a_stand_and_its_deviations() -> None:

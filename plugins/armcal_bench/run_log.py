@@ -1,7 +1,8 @@
-"""The journal of a measuring run, what the run has done by it, and the dataset and summary that are left behind."""
+"""The folder of a measuring run or a recording: its journal is begun, or gone on with."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import pairwise
@@ -12,13 +13,40 @@ import numpy as np
 from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.devices.device import DeviceIdentity
-from armcal.errors import ConfigError
-from armcal.io.journal import JOURNAL_FILES, Entry, Journal, JournalFailedError, JournalFullError
-from armcal.io.plain_files import write_whole
+from armcal.errors import ConfigError, InputError, Location
+from armcal.io.journal import JOURNAL_FILES, Entry, Journal, JournalFailedError, JournalFullError, has_journal
+from armcal.io.plain_files import check_folder, write_whole
 from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 from typing_extensions import override
+
+Start = Literal["anew", "resume"]
+
+
+@contextmanager
+def opened_journal(
+    folder: Path, start: Start, ours: Collection[str], header: Mapping[str, Any], noun: str, same: Mapping[str, str]
+) -> Iterator[Journal]:
+    where = Location(str(folder))
+    is_there = has_journal(folder)
+    if start == "resume" and not is_there:
+        raise InputError(f"it holds no {noun} to resume.", where=where, hint="Leave --resume out to begin one.")
+    if not is_there:
+        check_folder(folder, ours)
+    with Journal(folder, header) as journal:
+        if start == "anew" and not journal.is_new:  # a run that was refused before anything moved left an empty one
+            hint = "Give another --out, or go on by --resume."
+            raise InputError(f"it holds a {noun} already.", where=where, hint=hint)
+        for key, name in same.items():
+            begun, now, lists = journal.header.get(key), header[key], ""
+            if begun != now:
+                if isinstance(begun, list):
+                    lists = f" ({', '.join(begun) or 'none'}, now {', '.join(now) or 'none'})"
+                hint = f"Give the {name} that it was begun with, or another --out."
+                raise InputError(f"it was begun with another {name}{lists}.", where=where, hint=hint)
+        yield journal
+
 
 STARTED, ENERGISED, GOING, HERE = "started", "energised", "going", "here"
 MEASURED, LEFT_OUT, NOTICE, ENDED = "measured", "left_out", "told", "ended"  # Kinds of entries
@@ -35,8 +63,6 @@ EndedHow = Literal["done", "held", "parked", "refused", "failed"]
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a run stands."""
-
     measured: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # what was written, by pose id, in order
     left_out: Mapping[str, str] = field(default_factory=dict)  # why, by pose id
     angles: Mapping[str, float] = field(default_factory=dict)  # commanded last (rad, by joint); empty before the first
@@ -45,7 +71,6 @@ class Progress:
     ended: str = ""  # how it ended, if it did: see ``EndedHow``
 
     def after(self, kind: str, content: Mapping[str, Any]) -> Self:
-        """One entry later."""
         if kind == STARTED:
             return replace(self, ended="")
         if kind == MEASURED:
@@ -87,10 +112,7 @@ class Log:
 
 
 class RunLog(Log):
-    """An open journal; ``identity`` is that of the device that the run began with, None where it did not.
-
-    It raises JournalFullError or JournalFailedError once alone: what comes after that is the way home.
-    """
+    """An open journal; that it is full or failed is raised once alone: what comes after that is the way home."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
@@ -98,6 +120,10 @@ class RunLog(Log):
         started = [entry.content for entry in journal.entries() if entry.kind == STARTED]
         self.identity = DeviceIdentity(started[-1]["name"], started[0]["device"]) if started else None
         self._failed = False
+
+    def begin(self, identity: DeviceIdentity, at: float) -> None:
+        self.record(STARTED, {"at": at, "device": identity.digest, "name": identity.name})
+        self.identity = identity
 
     @override
     def record(self, kind: str, content: Mapping[str, Any]) -> None:
@@ -130,7 +156,6 @@ def measured_by(experiment: Experiment) -> tuple[str, tuple[str, ...]]:
 
 
 def dataset_of(experiment: Experiment, progress: Progress, digests: Mapping[str, str]) -> Dataset:
-    """The poses that are measured, in the order of measuring."""
     instance, local = measured_by(experiment)
     arm = next(iter(experiment.system.arms))
     records = list(progress.measured.values())
@@ -173,13 +198,11 @@ def in_order(progress: Progress) -> bool:
 
 
 def write_measured(folder: Path, experiment: Experiment, progress: Progress, digests: Mapping[str, str]) -> None:
-    """Replace the dataset, where a pose is measured; see ``write_outputs``."""
     if progress.measured:
         dataset = dataset_of(experiment, progress, digests)
         write_csv(folder / DATASET, dataset, experiment.request(measured=True).channels)
 
 
 def write_outputs(folder: Path, experiment: Experiment, progress: Progress, summary: Mapping[str, Any]) -> None:
-    """Replace dataset and summary, each whole."""
     write_measured(folder, experiment, progress, summary["digests"])
     write_whole(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())

@@ -22,6 +22,8 @@ from armcal.measure.tables import write_csv
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
 
+from armcal_bench.run_log import DATASET
+
 _FULL_TURN = 2 * math.pi * (1 + 1e-9)
 _LONG_ENOUGH = 0.8  # Of the window: readings need not fall on its ends
 _MOST = 100_000
@@ -29,8 +31,6 @@ _MOST = 100_000
 
 @dataclass(frozen=True)
 class JointKinds:
-    """What the channels of some arms are."""
-
     dimensions: Mapping[str, str]  # ``angle`` or ``length`` by channel, in order
     endless: frozenset[str]  # channels of joints that may turn on and on
 
@@ -63,8 +63,6 @@ class JointKinds:
 
 @dataclass(frozen=True)
 class Mean:
-    """The readings of a window."""
-
     angles: Mapping[str, float]  # means by channel
     spread: float  # of the joint that moved most (rad or m)
     readings: int
@@ -73,14 +71,7 @@ class Mean:
 
 
 class SampleWindow:
-    """The newest readings; times are the source's own where it gives them.
-
-    Args:
-        kinds: of the joints.
-        length: how much is kept (s).
-        spread, sliding_spread: how far turning and sliding joints may move in it (rad, m).
-        least: how many readings it needs.
-    """
+    """The newest readings; times are the source's own where it gives them."""
 
     def __init__(self, kinds: JointKinds, length: float, spread: float, sliding_spread: float, least: int) -> None:
         self._kinds, self._length, self._least = kinds, length, least
@@ -109,7 +100,6 @@ class SampleWindow:
         return len(self._samples) < self._least or lasts < _LONG_ENOUGH * self._length
 
     def mean(self) -> Mean | str:
-        """The posture, or why there is none: a sentence."""
         count = len(self._samples)
         if not count:
             return "no joint readings came."
@@ -141,24 +131,17 @@ class SampleWindow:
 
 
 class RecordingSettings(Settings):
-    """How postures are captured.
-
-    Attributes:
-        spread: no turning joint moves by more within the window; ``sliding_spread``: no sliding one.
-        alike: postures of one group whose joints all differ by less are reported as nearly the same.
-        groups: names that the digits stand for, ``[front/hole_0, front/hole_1]``; an asterisk keeps what was named
-            before. Without any, those that the measurements' settings speak of.
-    """
+    """How postures are captured."""
 
     window: Duration = 0.5  # a posture is the mean of the readings of so long
     samples: Annotated[int, Field(ge=2)] = 5  # it has at least so many
-    spread: Angle = math.radians(0.2)
-    sliding_spread: Length = 0.0002
+    spread: Angle = math.radians(0.2)  # no turning joint moves by more meanwhile
+    sliding_spread: Length = 0.0002  # and no sliding one
     stale: Duration = 1.0  # a stream that is silent for longer does not show where the arm stands now
     rest: Duration = 1.0  # with ``--capture still``, how long the arm must stand before it is captured by itself
     moved: Angle = math.radians(5.0)  # and how far a joint must have gone since the posture before
-    alike: Angle = math.radians(2.0)
-    groups: tuple[str, ...] = ()
+    alike: Angle = math.radians(2.0)  # nearer postures of one group are reported as nearly the same
+    groups: tuple[str, ...] = ()  # what the digits stand for; ``*/hole_0`` keeps the part before
 
     @model_validator(mode="after")
     def _above_zero(self) -> Self:
@@ -172,13 +155,6 @@ KEPT = "*"  # A part of a name that stays what it was
 
 
 class Labels:
-    """The labels that the next posture gets.
-
-    Args:
-        measurements: by instance; their groups' labels are asked for.
-        known: names that digits stand for; those that the measurements' settings speak of where there are none.
-    """
-
     def __init__(self, measurements: Mapping[str, Measurement], known: Sequence[str]) -> None:
         self._grouped = [m for m in measurements.values() if isinstance(m, GroupedMeasurement)]
         self.columns = tuple(dict.fromkeys(label for m in self._grouped for label in m.group_labels))
@@ -191,11 +167,7 @@ class Labels:
         return "/".join(self.present.get(column, "?") for column in self.columns)
 
     def name(self, text: str) -> str:
-        """Take a name, ``front/hole_0``, or only its last parts; a digit stands for a known one.
-
-        Returns:
-            why it is refused, a sentence; empty if it is taken.
-        """
+        """Take a name, ``front/hole_0``, or its last parts, or a digit for a known one; why it is refused, if it is."""
         if not self.columns:
             return "the measurements ask for no names: every posture belongs to the same group."
         text = text.strip()
@@ -236,7 +208,6 @@ class Labels:
         return ""
 
 
-DATASET = "dataset.csv"
 IMAGES = "images"
 OURS = (DATASET, *JOURNAL_FILES, IMAGES)
 CAPTURED, UNDONE = "captured", "undone"  # Kinds of entries
@@ -244,8 +215,6 @@ CAPTURED, UNDONE = "captured", "undone"  # Kinds of entries
 
 @dataclass(frozen=True)
 class Posture:
-    """The mean of readings of arms that stood still."""
-
     name: str  # its number, counted from 1 over all that were ever captured here
     angles: Mapping[str, float]  # by channel (``arm.q1``; rad, or m of sliding joints)
     spread: float  # the largest less the smallest reading of the joint that moved most (rad or m)
@@ -266,16 +235,10 @@ class Posture:
 
 
 class RecordingLog:
-    """An open journal and the postures in it, in order.
-
-    Attributes:
-        last: the newest that was captured, undone or not; None if there is none.
-    """
-
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
         self._postures: dict[str, Posture] = {}
-        self.last: Posture | None = None
+        self.last: Posture | None = None  # captured, undone or not
         self._count = 0
         for entry in journal.entries():
             if entry.kind == CAPTURED:
@@ -293,12 +256,10 @@ class RecordingLog:
         return Posture(name, dict(mean.angles), mean.spread, mean.readings, at, dict(labels), mean.stamp, values=values)
 
     def capture(self, posture: Posture) -> None:
-        """Write the next posture, which outlasts a power loss then; see ``Journal.record`` for what it raises."""
         self._journal.record(CAPTURED, posture.as_dict())
         self._take(posture)
 
     def undo(self) -> Posture | None:
-        """Take the last posture back, for good; None if there is none."""
         if not self._postures:
             return None
         name = next(reversed(self._postures))
@@ -326,11 +287,6 @@ def dataset_of(postures: Sequence[Posture], doubts: Mapping[str, str] | None = N
 
 
 def write_dataset(folder: Path, experiment: Experiment, postures: Sequence[Posture], doubts: Mapping[str, str]) -> None:
-    """Replace the dataset, whole; without postures there is none.
-
-    Raises:
-        DataError: it cannot be written.
-    """
     if not postures:
         (folder / DATASET).unlink(missing_ok=True)
         return

@@ -11,19 +11,17 @@ from armcal.arm.assembly import Arm
 from armcal.arm.clearance import ClearanceCheck
 from armcal.arm.joints import joint_limits, unknown_joint
 from armcal.base.arrays import Array, Mask
-from armcal.base.dataset import Dataset
+from armcal.base.dataset import SetAside
 from armcal.calibration.rigid_chain import nominal_tools
 from armcal.devices.device import DeviceRefusedError, JointDevice, MeasuringDevice, standing_at
 from armcal.errors import ConfigError, DataError, Location
 from armcal.run.experiment import Experiment, clearance_check
 from armcal.run.plan import JointSpace, approach_channels, commands_of, read_poses, stated_beyond
 
-from armcal_bench.acquisition.drive import JointPath, PathPlanner, travel
-from armcal_bench.acquisition.heat import COOLED_TO, NEVER, HeatModel, holding_torques
-from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.tracker_monitor import Arrival
-from armcal_bench.bench import Bench
-from armcal_bench.hazards import HazardJudge
+from armcal_bench.bench import AcquisitionSettings, Bench
+from armcal_bench.drive import JointPath, PathPlanner, travel
+from armcal_bench.hazards import COOLED_TO, NEVER, HazardJudge, HeatModel, holding_torques
+from armcal_bench.tracker_monitor import Arrival
 
 _AT = ("bench", "acquisition")
 _SLACK = 1e-9
@@ -32,8 +30,6 @@ _SAMPLES = 8
 
 @dataclass(frozen=True)
 class Measure:
-    """Go to a pose and measure there."""
-
     pose: int
     path: JointPath
     seconds: float
@@ -42,8 +38,6 @@ class Measure:
 
 @dataclass(frozen=True)
 class Rest:
-    """Go to where the arm parks and wait there."""
-
     path: JointPath
     seconds: float
     thermal_state: Array
@@ -51,8 +45,6 @@ class Rest:
 
 @dataclass(frozen=True)
 class LeaveOut:
-    """A pose that cannot be measured, and why."""
-
     pose: int
     why: str
 
@@ -62,8 +54,6 @@ Next = Measure | Rest | LeaveOut
 
 @dataclass(frozen=True)
 class Scheduler:
-    """Decides from where the arm stands, how warm its servos are, and what is left."""
-
     poses: Array  # N x joints, rad
     ids: tuple[str, ...]  # of the poses
     approaches: Array  # from which side each joint is to come (N x joints): 1 from below, -1 from above, 0 either
@@ -104,7 +94,6 @@ class Scheduler:
         return Measure(pose, path, gone + self.capture, np.maximum(there, after))
 
     def _fits(self, step: Measure | LeaveOut) -> bool:
-        """Within the budget there, and on the path to where it rests."""
         if isinstance(step, LeaveOut) or self.model.over(step.thermal_state):
             return False
         back = self.planner.find(step.path[-1], self.park)
@@ -125,8 +114,6 @@ class Scheduler:
 
 @dataclass(frozen=True)
 class ScheduleForecast:
-    """What a run is expected to take."""
-
     steps: tuple[Next, ...]  # in order
     seconds: float  # from the first move to the last capture
     travel: float  # of the joint that turns most in each move, rad
@@ -154,25 +141,18 @@ def forecast_schedule(scheduler: Scheduler, at: Array, thermal_state: Array, lef
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that a run needs besides its devices."""
-
     bench: Bench
     settings: AcquisitionSettings
     device: JointDevice
-    plan: Dataset  # joint commands and the plan's ids, in its order
     scheduler: Scheduler  # over the angles that the device can set nearest to them; with the planner and the heat model
     arrival: Arrival  # whether the arm stands where it was commanded to
     judge: HazardJudge  # of what is dangerous in the first motions and the last
-    warnings: tuple[str, ...]  # of limits beyond the arm model's own
+    set_aside: tuple[SetAside, ...] = ()  # rows of the plan that are not driven
+    warnings: tuple[str, ...] = ()  # of limits beyond the arm model's own
 
 
 def prepare(experiment: Experiment, plan: Path) -> Prepared:
-    """Read a plan and check it against limits, pulse tables and clearance. Asks no device.
-
-    Raises:
-        ConfigError, PluginError: the bench is refused.
-        DataError: the plan is refused, with the row of the first pose that the arm must not go to.
-    """
+    """Read a plan and check it against limits, pulse tables and clearance. Asks no device."""
     bench = Bench.of(experiment)
     settings, arm, device = bench.settings.acquisition, bench.arm, bench.device()
     if settings.angles == "measured" and not isinstance(device, MeasuringDevice):
@@ -199,11 +179,18 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             poses.append(_nearest_settable(device, pose))  # half a count beyond a limit is the board's affair
         except DeviceRefusedError as fault:
             refuse(row, fault.message, fault.hint, fault)
-    park = _settable_park(experiment, settings, device, limits)
+    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
+    if unknown := unknown_joint(settings.park, joints):
+        raise ConfigError(f"{unknown}.", where=where)
+    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
+    if (outside := _outside(park, limits)).any():
+        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
+        raise ConfigError(text, where=where, hint="Choose another pose.")
+    park = _nearest_settable(device, park)
     # from which side each joint is to come; 0 where the plan does not say
     sides = [commands.column(c) if commands.has(c) else np.zeros(len(commands)) for c in approach_channels(space)]
     approaches = np.nan_to_num(np.array(sides).T.reshape(len(commands), -1))
-    prepared = of_poses(bench, settings, device, commands, np.array(poses), approaches, limits, park)
+    prepared = of_poses(bench, settings, device, commands.ids, np.array(poses), approaches, limits, park)
     planner = prepared.scheduler.planner
     for row, pose in enumerate(poses):
         if not planner.allowed(pose):
@@ -211,29 +198,20 @@ def prepare(experiment: Experiment, plan: Path) -> Prepared:
             refuse(row, f"pose {commands.ids[row]} is too near to something.", hint)
     check_park(experiment, planner, prepared.scheduler.model, park, device.joint_names)
     planned = experiment.settings.plan.limits if experiment.settings.plan else {}
-    return replace(prepared, warnings=stated_beyond(experiment, {**planned, **settings.limits}))
+    warnings = stated_beyond(experiment, {**planned, **settings.limits})
+    return replace(prepared, set_aside=tuple(commands.set_aside), warnings=warnings)
 
 
 def of_poses(
     bench: Bench,
     settings: AcquisitionSettings,
     device: JointDevice,
-    plan: Dataset,
+    ids: tuple[str, ...],
     poses: Array,
     approaches: Array,
     limits: Array,
     park: Array,
 ) -> Prepared:
-    """A run through poses (N x joints, rad) that were found to be allowed, as the device can set them.
-
-    Args:
-        bench, settings: of the run.
-        device: it moves all joints of the arm.
-        plan: with the ids of the poses.
-        poses, approaches: see ``Scheduler``.
-        limits: of the joints (joints x 2, rad).
-        park: where the arm rests (joints, rad).
-    """
     experiment, arm = bench.experiment, bench.arm
     settable = np.array(
         [
@@ -245,17 +223,13 @@ def of_poses(
     planner = PathPlanner(check, settable, known, settings.path_step, settings.seed)
     heat = heat_of(experiment, settings, arm)
     rate, capture = float(np.deg2rad(settings.rate_deg_per_s)), settings.settle.wait + settings.settle.window + 0.5
-    scheduler = Scheduler(poses, plan.ids, approaches, park, planner, heat, rate, capture)
-    judge = HazardJudge(device.joint_names, device.joint_names, limits, heat.torques, park)
+    scheduler = Scheduler(poses, ids, approaches, park, planner, heat, rate, capture)
+    judge = HazardJudge(device.joint_names, limits, heat.torques, park)
     arrival = Arrival(nominal_tools(arm, poses), settings.arrival)
-    return Prepared(bench, settings, device, plan, scheduler, arrival, judge, ())
+    return Prepared(bench, settings, device, scheduler, arrival, judge)
 
 
 def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> Array:
-    """The run's own, else the plan's, else the arm model's (joints x 2, rad).
-
-    ConfigError where a joint has none, is no joint, or does not turn.
-    """
     source, plan = experiment.source, experiment.settings.plan
     if sliding := [joint for joint, dimension in arm.commanded.items() if dimension != "angle"]:
         text = f"the joint {sliding[0]} slides, expected joints that turn: servos move angles."
@@ -272,22 +246,9 @@ def run_limits(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) 
     return np.array([ends for ends in limits.values() if ends is not None])
 
 
-def _settable_park(experiment: Experiment, settings: AcquisitionSettings, device: JointDevice, limits: Array) -> Array:
-    """The angles (joints, rad) that the device can set nearest to the park pose."""
-    where, joints = experiment.source.where((*_AT, "park")), device.joint_names
-    if unknown := unknown_joint(settings.park, joints):
-        raise ConfigError(f"{unknown}.", where=where)
-    park = np.array([settings.park.get(joint, 0.0) for joint in joints])
-    if (outside := _outside(park, limits)).any():
-        text = f"{joints[int(np.argmax(outside))]} would park outside its limits."
-        raise ConfigError(text, where=where, hint="Choose another pose.")
-    return _nearest_settable(device, park)
-
-
 def check_park(
     experiment: Experiment, planner: PathPlanner, heat: HeatModel, park: Array, joints: tuple[str, ...]
 ) -> None:
-    """Refuse a park pose (joints, rad) that is too near to something, or in which a servo would not cool."""
     where = experiment.source.where((*_AT, "park"))
     if not planner.allowed(park):
         raise ConfigError("the pose where the arm parks is too near to something.", where=where, hint="Choose another.")
@@ -303,7 +264,6 @@ def check_park(
 
 
 def _nearest_settable(device: JointDevice, pose: Array) -> Array:
-    """The angles (joints, rad) that the device can set nearest to a pose."""
     standing = standing_at(device, dict(zip(device.joint_names, pose.tolist(), strict=True)))
     return np.array([standing[joint] for joint in device.joint_names])
 
@@ -327,7 +287,6 @@ def _outside(pose: Array, limits: Array) -> Mask:
 
 
 def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
-    """What ``plan.clearance`` asks for; None where it is not given. See ``clearance_check`` for what it raises."""
     plan = experiment.settings.plan
     if plan is None or plan.clearance is None:
         return None
@@ -335,7 +294,6 @@ def clearance_of(experiment: Experiment, arm: Arm) -> ClearanceCheck | None:
 
 
 def heat_of(experiment: Experiment, settings: AcquisitionSettings, arm: Arm) -> HeatModel:
-    """The servos' model; ConfigError where the settings name no such joint, or nothing weighs anything."""
     where = experiment.source.where((*_AT, "heat"))
     if settings.heat and not arm.masses and not experiment.system.environment.payload_mass:
         text = "heat is to be reckoned with, and no part of the arm has a mass: no joint would hold anything."

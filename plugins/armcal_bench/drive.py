@@ -12,10 +12,10 @@ from armcal.base.arrays import Array
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceError, DeviceRefusedError, JointDevice, measured_angles, standing_at, state_of
 
-from armcal_bench.acquisition.heat import HeatModel, ThermalState
-from armcal_bench.acquisition.run_log import ENERGISED, Log
-from armcal_bench.acquisition.settings import AcquisitionSettings
-from armcal_bench.acquisition.tracker_monitor import MayMove, unguarded
+from armcal_bench.bench import AcquisitionSettings
+from armcal_bench.hazards import HeatModel, ThermalState
+from armcal_bench.run_log import ENERGISED, Log
+from armcal_bench.tracker_monitor import MayMove, unguarded
 
 _SPREAD = 256
 _TRIED_AT_ONCE = 24
@@ -27,17 +27,7 @@ JointPath = tuple[Array, ...]
 
 
 class PathPlanner:
-    """Straight lines where they are clear; else the shortest path through known poses and others all over joint space.
-
-    A lazy roadmap: a line is checked only when a shortest path would use it. [Bohlin2000]
-
-    Args:
-        check: of clearance; None where nothing is too near.
-        limits: of the joints (joints x 2, rad).
-        known: poses that are worth going through (N x joints).
-        step: how far apart the poses of a line are that are checked (rad, of the joint that turns most).
-        seed: of the poses that are spread.
-    """
+    """Straight lines where they are clear; else a lazy roadmap through ``known`` poses and others. [Bohlin2000]"""
 
     def __init__(self, check: ClearanceCheck | None, limits: Array, known: Array, step: float, seed: int = 0) -> None:
         self._check, self._limits, self._known, self._step, self._seed = check, limits, known, step, seed
@@ -45,15 +35,12 @@ class PathPlanner:
         self.meanwhile: Callable[[], None] = lambda: None  # called during a search, which may take seconds
 
     def allowed(self, pose: Array) -> bool:
-        """Whether nothing is too near there (joints, rad)."""
         return self._check is None or bool(self._check(pose[:, None]).allowed[0])
 
     def within(self, pose: Array) -> bool:
-        """Whether it lies within the limits (joints, rad)."""
         return bool(np.all((pose >= self._limits[:, 0]) & (pose <= self._limits[:, 1])))
 
     def trouble(self, joints: Sequence[str], pose: Array) -> str:
-        """What is wrong with a pose (joints, rad); empty if nothing is."""
         rows = zip(joints, np.degrees(pose), np.degrees(self._limits), strict=True)
         parts = [
             f"{joint} stands at {angle:.1f} deg, beyond {low:.1f} to {high:.1f} deg"
@@ -72,7 +59,6 @@ class PathPlanner:
         return self._clear[key]
 
     def _line(self, start: Array, goal: Array) -> Array:
-        """Poses of a straight line (joints x N)."""
         count = int(np.ceil(np.max(np.abs(goal - start)) / self._step)) + 1
         return np.asarray(start[:, None] + np.linspace(0.0, 1.0, max(count, 2)) * (goal - start)[:, None])
 
@@ -175,11 +161,9 @@ class Drive:
 
     @property
     def angles(self) -> dict[str, float]:
-        """The commanded joint angles (rad)."""
         return self._named(self.at)
 
     def take_over(self, angles: Mapping[str, float]) -> None:
-        """Joint angles (rad) that were commanded before, by this run or another."""
         self.at = np.array([angles.get(joint, self.at[i]) for i, joint in enumerate(self.joints)])
 
     def energise(self, known: Mapping[str, float]) -> None:
@@ -202,7 +186,6 @@ class Drive:
         self._guard(self.at)
 
     def standing(self) -> dict[str, float]:
-        """The angles that its pulses ask for (rad), read back; DeviceError where others were commanded."""
         commanded, angles = standing_at(self.device, self.angles), state_of(self.device).angles
         for joint, angle in commanded.items():
             if joint not in angles or abs(angles[joint] - angle) > _SAME_RAD:
@@ -212,7 +195,6 @@ class Drive:
         return commanded
 
     def measured(self) -> dict[str, float]:
-        """Where the joints stand (rad), by servos that know; empty for others."""
         return measured_angles(self.device)
 
     def go(self, path: Sequence[Array], may_move: MayMove) -> None:
@@ -264,13 +246,11 @@ class Drive:
                 return
 
     def stand(self, seconds: float, may_move: MayMove) -> None:
-        """Hold for some time."""
         until = self.clock.now() + seconds
         while (left := until - self.clock.now()) > 0:
             self._pause(min(left, _ALIVE_EVERY_S), may_move)
 
     def tick(self, may_move: MayMove) -> bool:
-        """One period of holding; whether the arm may move."""
         return self._pause(self.settings.period, may_move)
 
     def _pause(self, seconds: float, may_move: MayMove) -> bool:
@@ -299,11 +279,9 @@ class Drive:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with where the arm stands; empty if nothing is."""
         return self._planner.trouble(self.joints, self.at)
 
     def path_home(self, start: Array) -> JointPath | None:
-        """From a pose (joints, rad) to where the arm parks."""
         return self._planner.find(start, self.park)
 
     def hold(self) -> None:
@@ -311,7 +289,6 @@ class Drive:
         self.device.guard([self.angles], self._rate, self.settings.silence)
 
     def note(self) -> None:
-        """Write down where it is and how hot."""
         self._noted = self.clock.now()
         self._log.note_angles(self.angles, self.thermal_state.by_joint, self.clock.wall())
 

@@ -24,11 +24,10 @@ from armcal.io.plain_files import write_over
 from armcal.measure.checks import warn_beyond_limits
 from armcal.plugins import refuse
 
+from armcal_bench.agreement import Assessment, Assessor, contacts_of
 from armcal_bench.bench import Bench, closing
-from armcal_bench.journal_folder import Start, opened_journal
 from armcal_bench.keys import END, OperatorInput
-from armcal_bench.recording.agreement import Assessment, Assessor, contacts_of
-from armcal_bench.recording.postures import (
+from armcal_bench.postures import (
     IMAGES,
     OURS,
     JointKinds,
@@ -40,6 +39,7 @@ from armcal_bench.recording.postures import (
     dataset_of,
     write_dataset,
 )
+from armcal_bench.run_log import Start, opened_journal
 
 Capture = Literal["keys", "still", "images"]
 """When postures are captured: at a command, when the arm has stood for a while, or when an image comes."""
@@ -50,20 +50,12 @@ _MOST_UNSEEN = 20  # Images without a board, and none with one: something is wro
 
 @dataclass(frozen=True)
 class Message:
-    """One event of a recording.
-
-    Attributes:
-        kind: ``captured``, ``refused``, ``undone``, ``named``, ``disagrees``, ``agrees_again``, ``known``, ``status``,
-            ``warning``, ``silent``, ``heard``, ``seen``, ``next``, ``finished``.
-    """
-
-    kind: str
+    kind: str  # ``captured``, ``refused``, ``undone``, ``disagrees``, ``known``, ...
     sentence: str  # for people
     content: Mapping[str, Any] = field(default_factory=dict)  # for programs; JSON
 
 
 def _captured(posture: Posture, assessment: Assessment) -> Message:
-    """A posture is safe, and agrees or has nothing to be compared with."""
     where = f" in {posture.place}" if posture.place else ""
     offset, doubt = assessment.newest, assessment.doubts.get(posture.name)
     content: dict[str, Any] = {"posture": posture.as_dict(), "doubtful": doubt is not None}
@@ -81,7 +73,6 @@ def _captured(posture: Posture, assessment: Assessment) -> Message:
 
 
 def _doubts_changed(before: Assessment, after: Assessment, postures: Sequence[Posture]) -> list[Message]:
-    """Postures that disagree now and did not before, and the other way round."""
     messages, standing = [], {posture.name: posture for posture in postures}
     for name, offset in after.doubts.items():
         if name not in before.doubts:
@@ -121,18 +112,6 @@ def _advised(after: Assessment, before: Assessment) -> list[Message]:
 
 
 class Recorder:
-    """Takes readings and commands, and gives back messages about what came of them.
-
-    Args:
-        bench: what is recorded, and when a posture is one.
-        stream: of the readings; it is used only for why it is silent.
-        capture: what makes a posture be captured.
-        folder: for the dataset and the images.
-        log: the journal.
-        clock: the bench's.
-        camera: an open one that sees what the arm shows; None where postures are all there is.
-    """
-
     def __init__(
         self,
         bench: Bench,
@@ -172,7 +151,6 @@ class Recorder:
         return [there, *self._known()]
 
     def take(self, samples: Sequence[JointSample]) -> list[Message]:
-        """Readings that came."""
         messages: list[Message] = []
         for sample in samples:
             self._fault = self.kinds.fault_of(sample.angles)
@@ -209,7 +187,6 @@ class Recorder:
         return messages
 
     def command(self, text: str) -> list[Message]:
-        """Something that was typed."""
         word, _, rest = text.strip().partition(" ")
         if word in ("", "c", "v"):
             if self.capture == "images":
@@ -262,7 +239,6 @@ class Recorder:
         return [] if is_repeated else messages
 
     def _looked(self, mean: Mean) -> list[Message]:
-        """What an image would add, which is not kept."""
         if self._camera is None:
             return [_refused("there is no camera to look by: give --camera.")]
         shot = shot_of(self._camera)
@@ -298,11 +274,6 @@ class Recorder:
         return messages + self._warnings(posture) + self._known()
 
     def _without_board(self, mean: Mean, shot: Shot) -> Message:
-        """About an image that says nothing.
-
-        Raises:
-            InputError: so many did not, and none did.
-        """
         self._looked_from = mean.angles
         self._unseen += 1
         if self._unseen >= _MOST_UNSEEN and self._log.last is None:
@@ -342,7 +313,6 @@ class Recorder:
         return float(np.max([abs(one[channel] - other[channel]) for channel in self.kinds.channels]))
 
     def _known(self) -> list[Message]:
-        """How much is determined, and what would help."""
         known = self._assessment.known
         if known is None:
             return []
@@ -390,20 +360,6 @@ def record(
     asked_to_end: Callable[[], bool],
     show: Callable[[Message], None],
 ) -> Message:
-    """Record until somebody ends it, or the stream ends; how it ended.
-
-    Args:
-        bench: what is recorded.
-        to: where everything of it is kept, and ``anew``, or ``resume`` what is there.
-        capture: what makes a posture be captured; a camera that gives images by itself goes before it.
-        keys: what a person types.
-        asked_to_end: whether somebody wants it to end.
-        show: called with every message.
-
-    Raises:
-        InputError: the configuration, the folder or the stream is refused.
-        ArmcalError: the journal cannot be written; all postures that were said to be kept are.
-    """
     camera = bench.camera()
     channels = JointKinds.of(bench.experiment.system.arms).channels
     columns = Labels(bench.experiment.system.measurements, ()).columns
@@ -431,7 +387,6 @@ def record(
 def _messages(
     recorder: Recorder, stream: JointStream, keys: OperatorInput, asked_to_end: Callable[[], bool], clock: Clock
 ) -> Iterator[Message]:
-    """All that happens, as it does, until somebody ends it or the stream ends."""
     yield from recorder.begin()
     while True:
         has_ended = stream.ended  # before its last samples are taken

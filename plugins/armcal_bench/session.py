@@ -2,8 +2,8 @@
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -25,12 +25,14 @@ from armcal.devices.wiring import wiring_of
 from armcal.errors import InputError, Location
 from armcal.plugins import blaming
 
-from armcal_bench.acquisition import run_log
-from armcal_bench.acquisition.drive import Drive
-from armcal_bench.acquisition.heat import ThermalLimit
-from armcal_bench.acquisition.preparation import LeaveOut, Measure, Prepared, Rest, Scheduler
-from armcal_bench.acquisition.run_log import EndedHow, Log, Progress, RunLog
-from armcal_bench.acquisition.tracker_monitor import (
+from armcal_bench import run_log
+from armcal_bench.bench import closing
+from armcal_bench.drive import Drive
+from armcal_bench.hazards import FirstMotion, ThermalLimit
+from armcal_bench.keys import OperatorInput
+from armcal_bench.preparation import LeaveOut, Measure, Prepared, Rest, Scheduler
+from armcal_bench.run_log import EndedHow, Log, Progress, RunLog, Start, opened_journal
+from armcal_bench.tracker_monitor import (
     Evidence,
     MotionGate,
     Settled,
@@ -41,9 +43,6 @@ from armcal_bench.acquisition.tracker_monitor import (
     pose_of,
     unguarded,
 )
-from armcal_bench.bench import closing
-from armcal_bench.hazards import FirstMotion
-from armcal_bench.journal_folder import Start, opened_journal
 
 T = TypeVar("T")
 WhenStopped = Literal["park", "hold"]
@@ -62,17 +61,18 @@ class ReconnectError(Exception):
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended, a sentence why, and what the arm does then where it does not park."""
-
     how: EndedHow
     sentence: str
     arm: str = "the arm holds"
 
 
+def known_poses(ids: Sequence[str], progress: Progress) -> dict[int, Array]:
+    """``base_T_target`` (4 x 4, m) of measured poses, by their index."""
+    return {i: pose_of(progress.measured[name]) for i, name in enumerate(ids) if name in progress.measured}
+
+
 @dataclass
 class AcquisitionRun:
-    """One run over one plan, from its progress on, with a device that was opened with an identity."""
-
     _drive: Drive
     _identity: DeviceIdentity
     _scheduler: Scheduler
@@ -91,11 +91,7 @@ class AcquisitionRun:
         self._left = [i for i, name in enumerate(self._ids) if name not in done]
 
     def run(self) -> Ending:
-        """To its end; whatever happens on the way, the arm is held or parked.
-
-        Raises:
-            ArmcalError: the journal cannot be written, for one; the arm is parked by then, where it can be.
-        """
+        """To its end; whatever happens on the way, the arm is held or parked."""
         try:
             try:
                 self._persist(self._energise)
@@ -105,7 +101,11 @@ class AcquisitionRun:
             except (StopRequested, DeviceUnwellError) as request:
                 how: EndedHow = request.how if isinstance(request, StopRequested) else "parked"
                 if how == "parked" and self._when_stopped == "hold" and self._gate.asked_to_end():
-                    return self._hold_and_end(str(request))
+                    try:
+                        self._drive.hold()  # should the host fall silent too
+                    except DeviceError:
+                        return self._end("held", f"{request}, while the board was lost", _AS_IT_IS)
+                    return self._end("held", str(request))
                 return self._park_and_end(how, str(request))
             except ReconnectError as loss:
                 return self._end("held", f"{loss}; {_AS_IT_IS}", _AS_IT_IS)
@@ -122,12 +122,7 @@ class AcquisitionRun:
         self._drive.energise(self._log.progress.angles)
 
     def _persist(self, action: Callable[[], T], restore: Callable[[], None] | None = None) -> T:
-        """Do it; when the device fails, hold until it is back and energised (or ``restore``), and do it again.
-
-        Raises:
-            ReconnectError: it does not come back, or fails again at once, time after time.
-            DeviceUnwellError: it works, and the arm is to be parked.
-        """
+        """Do it; when the device fails, hold until it is back and energised (or ``restore``), and do it again."""
         while True:
             try:
                 result: T = blaming(action)()
@@ -218,12 +213,6 @@ class AcquisitionRun:
         else:
             self._accept(step.pose, settled)
 
-    @property
-    def known(self) -> dict[int, Array]:
-        """``base_T_target`` (4 x 4, m) of measured poses, by their index."""
-        measured = self._log.progress.measured
-        return {i: pose_of(measured[name]) for i, name in enumerate(self._ids) if name in measured}
-
     def _sees_again(self) -> bool:
         until = self._gate.clock.now() + self._settings.settle.longest
         while self._gate.clock.now() < until:
@@ -233,7 +222,6 @@ class AcquisitionRun:
         return False
 
     def _accept(self, pose: int, settled: Settled) -> None:
-        """Write down where the arm stands, unless that is not where it was commanded to."""
         drive = self._drive
         commanded, readings = drive.standing(), [drive.measured() for _ in range(_READINGS)]
         measured = {joint: sum(reading[joint] for reading in readings) / _READINGS for joint in readings[0]}
@@ -252,7 +240,7 @@ class AcquisitionRun:
             **angles,
             "approach": dict(zip(drive.angles, drive.approach.tolist(), strict=True)),
         }
-        doubt = self._evidence.arrival.doubt(pose, settled.base_T_target, self.known)
+        doubt = self._evidence.arrival.doubt(pose, settled.base_T_target, known_poses(self._ids, self._log.progress))
         self._evidence.doubted[pose] = record
         self._check_frame()
         if doubt:
@@ -268,7 +256,7 @@ class AcquisitionRun:
 
     def _check_frame(self) -> None:
         """Stop where units or frame are others than expected; poses that seemed astray in it are kept as measured."""
-        if refusal := self._evidence.refusal(self.known):
+        if refusal := self._evidence.refusal(known_poses(self._ids, self._log.progress)):
             for pose, record in self._evidence.doubted.items():
                 if pose in self._left:
                     self._keep(pose, record)
@@ -299,16 +287,7 @@ class AcquisitionRun:
         self._left.remove(pose)
         self._on_progress(self._log.progress)
 
-    def _hold_and_end(self, why: str) -> Ending:
-        """Stay, should the host fall silent too."""
-        try:
-            self._drive.hold()
-        except DeviceError:
-            return self._end("held", f"{why}, while the board was lost", _AS_IT_IS)
-        return self._end("held", why)
-
     def _park_and_end(self, how: EndedHow, why: str) -> Ending:
-        """Park, and release the servos where the settings ask for it; the arm holds where no path home is found."""
         try:
             if not self._persist(self._park):
                 return self._end("held", f"{why}; no clear path to where it parks was found")
@@ -319,7 +298,6 @@ class AcquisitionRun:
         return self._end(how, why)
 
     def _park(self) -> bool:
-        """Whether a clear path to where the arm parks was found, and gone."""
         path = self._drive.path_home(self._drive.at)
         if path is None:
             return False
@@ -340,46 +318,37 @@ _SAME = {"plan": "plan", "config": "configuration"}
 
 
 @dataclass(frozen=True)
-class RunOptions:
-    """How a run is done, and who hears of it."""
-
-    folder: Path  # where everything of it is kept
-    start: Start  # ``anew``, or ``resume`` what is there
-    asked_to_end: Callable[[], bool]  # whether somebody wants it parked
+class Conversation:
+    asked_to_stop: Callable[[], bool]  # whether somebody wants its end
     may_energise: Callable[[FirstMotion], bool]  # asked once before anything moves, with what is dangerous in it
-    on_progress: Callable[[Progress], None]  # called after each pose
-    unchecked: bool = False  # drive servos too of which nobody has checked that they move their joint
+    report: Callable[[Progress, int], None] = lambda progress, total: None  # called after each of so many poses
+    say: Callable[[str], None] = lambda text: None  # takes a line, of a guided calibration
+    operator: Callable[[], AbstractContextManager[OperatorInput]] = lambda: nullcontext(OperatorInput(None))
     waits: Waits = field(default_factory=Waits)  # says what is waited for
-    when_stopped: WhenStopped = "park"  # what the arm does when somebody asks for the end
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended, and its summary as it was written."""
-
     ending: Ending
     summary: dict[str, Any]
 
 
-def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
-    """Drive the plan.
-
-    Raises:
-        InputError: the folder, the board or the tracker is refused; nothing was moved.
-        DeviceError: the board does not answer at all.
-        ArmcalError: the journal cannot be written; the arm was parked.
-    """
+def acquire(
+    prepared: Prepared, plan: Path, folder: Path, start: Start, talk: Conversation, *, unchecked: bool = False
+) -> Outcome:
+    """Drive the plan, ``unchecked`` with servos too of which nobody has checked that they move their joint."""
     experiment, ids = prepared.bench.experiment, prepared.scheduler.ids
     run_log.measured_by(experiment)
     header = _header(prepared, plan)
-    kept = opened_journal(options.folder, options.start, run_log.OURS, header, "run", _SAME)
-    with prepared.bench.clock() as clock, kept as journal:
+    with (
+        prepared.bench.clock() as clock,
+        opened_journal(folder, start, run_log.OURS, header, "run", _SAME) as journal,
+    ):
         log, drift = RunLog(journal), None
-        begun = identity = log.identity
-        poses = {i: pose_of(log.progress.measured[name]) for i, name in enumerate(ids) if name in log.progress.measured}
-        if (mistake := prepared.arrival.mistake(poses)) is not None:
+        begun = log.identity
+        if (mistake := prepared.arrival.mistake(known_poses(ids, log.progress))) is not None:
             hint = f"{mistake.mend} Then begin anew with another --out."
-            raise InputError(f"{mistake.sentence}; nothing was moved.", where=Location(str(options.folder)), hint=hint)
+            raise InputError(f"{mistake.sentence}; nothing was moved.", where=Location(str(folder)), hint=hint)
 
         def check(identity: DeviceIdentity) -> None:
             if begun is not None and begun.digest != identity.digest:
@@ -388,42 +357,40 @@ def acquire(prepared: Prepared, plan: Path, options: RunOptions) -> Outcome:
                     hint="Connect the board that the run began with, with the servo file that it began with.",
                 )
 
+        def begin(identity: DeviceIdentity) -> None:
+            log.begin(identity, clock.wall())
+
         def digests() -> dict[str, str]:
-            return {"board": identity.digest[:16] if identity else "", "config": header["config"][:16]}
+            return {"board": log.identity.digest[:16] if log.identity else "", "config": header["config"][:16]}
 
         is_done = {*log.progress.measured, *log.progress.left_out} >= set(ids)
-        if identity is not None and is_done and log.progress.ended in ("done", "parked", "failed"):
+        if begun is not None and is_done and log.progress.ended in ("done", "parked", "failed"):
             how, why = log.progress.at_the_end(len(ids))  # nothing needs to be there
             ending = Ending(how, "it was done before" if how == "done" else why)
         else:
             try:
-                with opened(prepared, options, clock, check) as (gate, identity):
-                    log.record(run_log.STARTED, {"at": clock.wall(), "device": identity.digest, "name": identity.name})
-                    evidence = Evidence(prepared.arrival)
-                    ending = ready_run(prepared, options, log, gate, identity, evidence).run()
-                    drift = evidence.drift()
+                evidence = Evidence(prepared.arrival)
+                ending, _ = drive_poses(prepared, talk, log, clock, evidence, check, begin, "park", unchecked)
+                drift = evidence.drift()
             except (Exception, SystemExit):
-                if identity is not None:
+                if log.identity is not None:
                     with suppress(Exception):  # the journal holds it, whatever else is broken
-                        run_log.write_measured(options.folder, experiment, log.progress, digests())
+                        run_log.write_measured(folder, experiment, log.progress, digests())
                 raise
-        gives_way = None if drift is None else drift.content
-        summary = _summary(prepared, ending, log.progress)
-        summary |= {"gives_way": gives_way, "board": identity.name, "digests": digests()}
-        run_log.write_outputs(options.folder, experiment, log.progress, summary)
+        summary = {
+            "how": ending.how,
+            "why": ending.sentence,
+            "poses": len(ids),
+            "measured": len(log.progress.measured),
+            "left_out": dict(log.progress.left_out),
+            "set_aside": {row.record_id: row.reason for row in prepared.set_aside},
+            "times": "written" if run_log.in_order(log.progress) else "left out: the clock was set back during the run",
+            "gives_way": drift,
+            "board": log.identity.name if log.identity else "",
+            "digests": digests(),
+        }
+        run_log.write_outputs(folder, experiment, log.progress, summary)
         return Outcome(ending, summary)
-
-
-def _summary(prepared: Prepared, ending: Ending, progress: Progress) -> dict[str, Any]:
-    return {
-        "how": ending.how,
-        "why": ending.sentence,
-        "poses": len(prepared.plan),
-        "measured": len(progress.measured),
-        "left_out": dict(progress.left_out),
-        "set_aside": {row.record_id: row.reason for row in prepared.plan.set_aside},
-        "times": "written" if run_log.in_order(progress) else "left out: the clock was set back during the run",
-    }
 
 
 def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
@@ -437,52 +404,59 @@ def _header(prepared: Prepared, plan: Path) -> dict[str, Any]:
     return {"plan": digest, "config": identity_of({**data, "bench": bench}), "began": time.time()}
 
 
-@contextmanager
-def opened(
-    prepared: Prepared, options: RunOptions, clock: Clock, check: Callable[[DeviceIdentity], None]
-) -> Iterator[tuple[MotionGate, DeviceIdentity]]:
-    """With device and tracker, both alive; nothing moves. ``check`` may refuse a device."""
-    device, monitor, now = prepared.device, TrackerMonitor(prepared.bench, clock), clock.now
+def drive_poses(
+    prepared: Prepared,
+    talk: Conversation,
+    log: Log,
+    clock: Clock,
+    evidence: Evidence,
+    check: Callable[[DeviceIdentity], None] = lambda identity: None,
+    begin: Callable[[DeviceIdentity], None] = lambda identity: None,
+    when_stopped: WhenStopped = "hold",
+    unchecked: bool = True,
+) -> tuple[Ending, DeviceIdentity]:
+    """Open device and tracker, ask whether the arm may be moved, and measure.
+
+    ``check`` may refuse the device; ``begin`` is called when nothing may refuse the run any more; ``when_stopped`` is
+    what the arm does when somebody asks for the end.
+    """
+    device, settings, scheduler, progress = prepared.device, prepared.settings, prepared.scheduler, log.progress
+    tracker, bodies = prepared.bench.tracker(), prepared.bench.settings.bodies
+    monitor = TrackerMonitor(tracker, clock, settings.settle, bodies, settings.lost.park)
     with closing(monitor, device):
         identity = open_device(device, clock)
         check(identity)
         wiring = wiring_of(prepared.bench.experiment.source, device)
-        if wiring is not None and not options.unchecked:
+        if wiring is not None and not unchecked:
             wiring.check(device.joint_names, identity.adapter)
         monitor.open()
-        until = now() + _FIRST_FRAME_S
-        while monitor.trouble()[0] and now() < until:
-            clock.sleep(prepared.settings.period)
+        until = clock.now() + _FIRST_FRAME_S
+        while monitor.trouble()[0] and clock.now() < until:
+            clock.sleep(settings.period)
             device.keep_alive()
             monitor.look()
         if monitor.trouble()[0]:
             why = f"the tracker gives nothing that could be used ({monitor.trouble()[1]}); nothing was moved."
             hint = "Start it, check its address and the names of its bodies, and let it see them."
             raise DeviceRefusedError(why, hint=hint)
-        yield MotionGate(monitor, clock, prepared.settings.lost, options.asked_to_end, options.waits), identity
-
-
-def ready_run(
-    prepared: Prepared,
-    options: RunOptions,
-    log: Log,
-    gate: MotionGate,
-    identity: DeviceIdentity,
-    evidence: Evidence,
-) -> AcquisitionRun:
-    """A run that may energise the arm; InputError where it may not."""
-    settings, scheduler, progress = prepared.settings, prepared.scheduler, log.progress
-    device, clock = prepared.device, gate.clock
-    drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)
-    scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
-    angles = state_of(device).angles
-    if progress.thermal_state:  # the warmth that an earlier part of the run has left
-        drive.thermal_state.go_on(progress.thermal_state, {**progress.angles, **angles}, clock.wall() - progress.at)
-    releases, measured = settings.at_end == "release", drive.measured()
-    start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
-    if angles:  # no signs of life reach the board while somebody thinks: joints that hold are to stay where they are
-        device.guard([angles], float(np.deg2rad(settings.rate_deg_per_s)), settings.silence)
-    before = options.asked_to_end()
-    if not options.may_energise(start) or (options.asked_to_end() and not before):
-        raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
-    return AcquisitionRun(drive, identity, scheduler, gate, log, evidence, options.on_progress, options.when_stopped)
+        drive = Drive(device, clock, scheduler.planner, settings, scheduler.model, log)
+        scheduler.planner.meanwhile = drive.keep_alive  # the board would take a host that plans for one that died
+        angles = state_of(device).angles
+        if progress.thermal_state:  # the warmth that an earlier part of the run has left
+            standing, since = {**progress.angles, **angles}, clock.wall() - progress.at
+            drive.thermal_state.go_on(progress.thermal_state, standing, since)
+        releases, measured = settings.at_end == "release", drive.measured()
+        start = prepared.judge.first_motion(angles, progress.angles, releases=releases, measured=measured)
+        if (
+            angles
+        ):  # no signs of life reach the board while somebody thinks: joints that hold are to stay where they are
+            device.guard([angles], float(np.deg2rad(settings.rate_deg_per_s)), settings.silence)
+        before = talk.asked_to_stop()
+        if not talk.may_energise(start) or (talk.asked_to_stop() and not before):
+            raise InputError("the arm may not be moved; nothing was moved.", hint="Say yes, or give --yes.")
+        begin(identity)
+        gate = MotionGate(monitor, clock, settings.lost, talk.asked_to_stop, talk.waits)
+        run = AcquisitionRun(
+            drive, identity, scheduler, gate, log, evidence, lambda p: talk.report(p, len(scheduler.ids)), when_stopped
+        )
+        return run.run(), identity

@@ -67,14 +67,10 @@ class RigidArm:
         return tuple(self.arm.commanded)
 
     def tool(self, pose: Pose) -> Array:
-        """``base_T_tool`` (4x4)."""
         return np.asarray(self._function(self._commands(pose))[0].full())
 
-    def axis(self, joint: str, pose: Pose) -> tuple[Array, Array]:
-        """A joint's axis in the base frame: its direction (unit) and a point on it (m)."""
-        return self.axes(pose)[joint]
-
     def axes(self, pose: Pose) -> dict[str, tuple[Array, Array]]:
+        """Of each joint in the base frame: the direction of its axis (unit) and a point on it (m)."""
         _, axes, origins = (np.asarray(dm.full()) for dm in self._function(self._commands(pose)))
         return {name: (axes[:, i], origins[:, i]) for i, name in enumerate(self.arm.joint_names)}
 
@@ -83,7 +79,6 @@ class RigidArm:
 
     @cached_property
     def _function(self) -> ca.Function:
-        """Commands to the tool, and each joint's axis and origin."""
         own = {block.name for block in self.arm.parameters()}
         values = {b.name: ca.SX(list(b.nominal)) for b in self.parameters.blocks if b.name in own}
         chain = self.arm.chain(values)
@@ -108,11 +103,6 @@ class Corrections(JointEffect):
 
     ``at3_0``, ``at3_1``, ... (rad) are what joint 3 stands off at the knots, linear between them; ``zero3`` is the same
     everywhere; it stops ``lag3`` short of its command when it comes from below, and as much beyond from above.
-
-    Args:
-        knots: angles (rad) by joint number (from 1).
-        zeros: joints that have a zero of their own beside.
-        lags: joints that came from both sides.
     """
 
     def __init__(self, knots: Mapping[int, Sequence[float]], zeros: Sequence[int], lags: Sequence[int]) -> None:
@@ -209,15 +199,7 @@ def body_dataset(
     approaches: Mapping[str, Array] = MappingProxyType({}),
     sweeps: Array | None = None,
 ) -> Dataset:
-    """Records of a body.
-
-    Args:
-        arm: its name.
-        angles, approaches: commanded angles, and from where they came, by joint (N each).
-        poses: N x 4 x 4.
-        noise: of the rotation about any axis (rad), and of each coordinate (m) (N each).
-        sweeps: the number of the sweep that each belongs to (N).
-    """
+    """Records of a body, with the noise of its rotation (rad) and of each coordinate (m) (N each)."""
     count = len(poses)
     channels = {f"{arm}.{joint}": values for joint, values in angles.items()}
     channels |= {f"{arm}.approach.{joint}": approach for joint, approach in approaches.items()}
@@ -231,15 +213,7 @@ def body_dataset(
 
 
 class BodyFit:
-    """Corrections of joints fitted to what was seen of a body; ``values`` are those of the last fit.
-
-    Args:
-        experiment: whose arm it is, at its parameters' nominal values.
-        corrections, body: what is added to it.
-        free: what may move, with the standard deviations about where it starts; None for no prior.
-        dataset: see ``body_dataset``.
-        springs: whether the arm's springs give.
-    """
+    """Corrections of joints fitted to what was seen of a body; ``free`` has the prior deviations of what may move."""
 
     def __init__(
         self,
@@ -272,11 +246,6 @@ class BodyFit:
         return self.problem.parameters
 
     def fit(self, dataset: Dataset, weights: Array) -> None:
-        """To records like those that it was built with, from where the last fit ended.
-
-        Raises:
-            NotConvergedError: a record has no elastic equilibrium.
-        """
         self.problem = self.problem.of(dataset, weights)
         posed = PosedProblem(self.problem)
         self.values = posed.values(descended(posed, posed.x(self.values), _MOST_STEPS, _DAMPING, _AT_REST))
@@ -290,7 +259,6 @@ class BodyFit:
 
     @property
     def noise_scale(self) -> float:
-        """Of the residuals, in units of the stated noise; one at least."""
         freedom = max(self.problem.equations() - self.problem.increments, 1)
         return max(1.0, float(np.sqrt(2 * self.problem.cost(self.values) / freedom)))
 

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import fdtri
 
-from armcal_bench.recording.postures import Posture, dataset_of
+from armcal_bench.postures import Posture, dataset_of
 
 _FAR = 100.0  # Ordinary sizes within which a group (a socket) is looked for
 _MOST_STEPS, _DAMPING = 30, 1e-9
@@ -59,10 +59,7 @@ _MOST_DROPPED = 3  # Of few postures; of many a third
 
 @dataclass(frozen=True)
 class Offset:
-    """How far a posture lies from where the others expect it, and how far was to be expected (root mean square).
-
-    Turns are zero for contacts that turn freely; pixels are a corner's, root mean square over the image.
-    """
+    """How far a posture lies from where the others expect it, and its typical size; turns of free contacts are 0."""
 
     off_mm: float
     expected_mm: float
@@ -84,8 +81,6 @@ def _short(number: float) -> str:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Values, how sure their coordinates are, and the noise found in units of the declared one."""
-
     values: Array
     half: Array  # a root of the covariance by coordinates (n x k)
     scale: float
@@ -94,18 +89,7 @@ class Fitted:
 
 
 class QuickFitter:
-    """A problem of some postures, compiled; fits of any of them.
-
-    Args:
-        experiment: with the parameters that the groups of the postures bring.
-        contacts: the measurements that joints alone make.
-        dataset: the postures.
-        known: values of an earlier fit, by parameter, where it begins; those that are not named begin where they are.
-
-    Raises:
-        NotConvergedError: a posture has no elastic equilibrium.
-        ProblemError: the postures leave open what an instrument finds by itself.
-    """
+    """A problem of some postures, compiled; fits of any of them, begun at the ``known`` values of an earlier fit."""
 
     def __init__(
         self,
@@ -172,7 +156,6 @@ class QuickFitter:
         return anew if scores[1] < scores[0] - 1 else kept
 
     def _trimmed(self, names: NDArray[np.object_], aside: Collection[int]) -> Fitted:
-        """Whatever lies far off by the median is set aside, the farthest first; what does not disagree comes back."""
         places = np.arange(len(names))
         fitted = self.fit(~np.isin(places, list(aside)))
         for _ in range(max(_MOST_DROPPED, len(names) // 3)):
@@ -219,7 +202,6 @@ class QuickFitter:
 
 
 def _used(problem: Problem, used: Mask) -> Problem:
-    """With nothing but some of the postures counted (N)."""
     return problem.weighted([used.astype(float)] * len(problem.records))
 
 
@@ -275,17 +257,12 @@ _UNFIT = (ArmcalError, ArithmeticError, ValueError)  # Faults of postures that n
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known, counted as ``armcal identify`` counts.
+    """What is known, counted as ``armcal identify`` counts."""
 
-    Attributes:
-        rank, free: determined combinations, of so many numbers.
-        missing: the undetermined combinations, once they are few.
-    """
-
-    rank: int
-    free: int
+    rank: int  # determined combinations
+    free: int  # of so many numbers
     records: int  # how many postures train
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # the undetermined combinations, once they are few
     vary: tuple[str, ...]  # joints that would add most if they were moved more, the best first
 
 
@@ -316,29 +293,17 @@ def _joints_to_vary(problem: Problem, dataset: Dataset, scaled: Array, rank: int
 
 @dataclass(frozen=True)
 class Assessment:
-    """What the postures determine, which of them disagree, and what would help.
-
-    Attributes:
-        newest: how the last posture lies to the others; None where there is nothing to compare it with.
-        accuracy: how well what an instrument's user wants to know is known, a sentence a measurement.
-        deviations: standard deviations of the instruments' own coordinates (SI); finite ones alone.
-    """
-
-    newest: Offset | None = None
+    newest: Offset | None = None  # of the last posture; None where there is nothing to compare it with
     doubts: Mapping[str, Offset] = field(default_factory=dict)  # postures that disagree, by name
     known: Knowledge | None = None  # what is determined; None if that could not be judged
     why_not: str = ""  # why not, a sentence
-    accuracy: tuple[str, ...] = ()
-    deviations: Mapping[str, float] = field(default_factory=dict)
+    accuracy: tuple[str, ...] = ()  # of what an instrument's user wants to know, a sentence a measurement
+    deviations: Mapping[str, float] = field(default_factory=dict)  # of the instruments' own coordinates (SI)
     next: Suggestion | None = None  # the posture that would help most; None where none is better than others
 
 
 def contacts_of(experiment: Experiment, camera: LiveCamera | None) -> dict[str, Measurement]:
-    """The measurements for which a posture, and a camera's image of it, is all there is to measure.
-
-    Raises:
-        ConfigError: there are none.
-    """
+    """The measurements for which a posture, and a camera's image of it, is all there is to measure."""
     seen = "" if camera is None else camera.measurement
     measurements = {n: m for n, m in experiment.system.measurements.items() if n == seen or not m.channels()}
     if not measurements:
@@ -352,8 +317,6 @@ def contacts_of(experiment: Experiment, camera: LiveCamera | None) -> dict[str, 
 
 
 class Assessor:
-    """Judges postures, and remembers which were in doubt and where the last fit ended."""
-
     def __init__(self, experiment: Experiment, camera: LiveCamera | None) -> None:
         self._experiment, self._contacts = experiment, contacts_of(experiment, camera)
         self._doubtful: Collection[str] = ()
@@ -380,10 +343,7 @@ class Assessor:
             return Assessment(why_not=str(fault))
 
     def explained(self, postures: Sequence[Posture]) -> tuple[str, ...]:
-        """Everything that is not determined, or hardly, with why: gauges too, which no posture would determine.
-
-        It takes a moment.
-        """
+        """Everything that is not determined, or hardly, with why: gauges too, which no posture would determine."""
         if not postures:
             return ()
         try:

@@ -1,4 +1,4 @@
-"""Pulse tables, backlash and springs from what a tracker, or somebody, saw of each joint's sweep.
+"""Pulse tables, backlash and springs from what a tracker, or somebody, saw of each joint's sweep, and their files.
 
 All sweeps are one problem of the arm's model: each joint stands where its table puts the pulse, with corrections at the
 table's knots, less half the backlash behind where it came from. The model's axes and springs move with them, every
@@ -6,27 +6,33 @@ number near its nominal value: what springs give is computed by the model, and a
 elsewhere computes it wrong. The corrections move the tables until nothing remains to correct.
 """
 
+import errno
+import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from armcal.arm.assembly import Arm
-from armcal.arm.servo import PulseClock, PulseTable
+from armcal.arm.servo import PulseTable
 from armcal.base.arrays import Array, Mask
+from armcal.base.config_text import finite
 from armcal.base.dataset import Dataset
 from armcal.base.poses import NO_TURN
 from armcal.base.quaternions import quaternion_of
+from armcal.config.servo_file import ServoFile, load_servo_file, servo_file_text
 from armcal.errors import NotConvergedError
+from armcal.io.plain_files import write_whole, writing
 from armcal.measure.rests import mean_rotation
 from armcal.run.experiment import Experiment
 from scipy.spatial.transform import Rotation
 
 from armcal_bench.joint_check import permuted
-from armcal_bench.servo.record import ANGLE, POSE
-from armcal_bench.servo.setup import KnownServo, ServoCalibrationSettings, piecewise
-from armcal_bench.servo.tracked_body import (
+from armcal_bench.servo_setup import ANGLE, POSE, KnownServo, ServoCalibrationSettings, next_name, piecewise
+from armcal_bench.tracked_body import (
     BODY,
     TABLES,
     Body,
@@ -39,24 +45,15 @@ from armcal_bench.servo.tracked_body import (
     twist_angles,
 )
 
-Zero = Literal["kept", "measured"]
-
 
 @dataclass(frozen=True)
 class FittedServo:
-    """A servo's table and backlash.
-
-    Attributes:
-        pulses, pulse_sds: at the knots (s); of a knot that no observation determines the stated pulse, and NaN.
-        lag, lag_sd: half the backlash (rad); None where it was not approached from both sides.
-    """
-
     known: KnownServo  # as it was stated
     angles: tuple[float, ...]  # knots (rad)
-    pulses: tuple[float, ...]
+    pulses: tuple[float, ...]  # at the knots (s); the stated one, and no deviation (NaN), where none is determined
     pulse_sds: tuple[float, ...]
     determined: tuple[bool, ...]  # whether the observations determine the pulse of a knot
-    lag: float | None
+    lag: float | None  # half the backlash (rad); None where it was not approached from both sides
     lag_sd: float
     scatter: float  # of the observed angles about the fit (rad, root mean square)
     scale: float  # the same in units of the stated deviations; deviations are enlarged by it where it is above 1
@@ -68,18 +65,11 @@ class FittedServo:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a record says.
-
-    Attributes:
-        compliances: of the arm's springs (rad/(N m)) by parameter, value and deviation, where they were determined.
-    """
-
     servos: Mapping[str, FittedServo]  # by joint
-    clocks: Mapping[str, PulseClock]  # by board, as stated when it was measured
     silent: Mapping[str, str]  # why a joint's table could not be found, by joint
-    compliances: Mapping[str, tuple[float, float]]
+    compliances: Mapping[str, tuple[float, float]]  # of springs (rad/(N m)), value and deviation, by parameter
     undetermined: tuple[str, ...]  # compliances that the observations do not determine
-    zero: Zero  # whether stated zeros were kept
+    keeps_zero: bool  # whether stated zeros were kept
     sag_span: Mapping[str, float]  # by joint, how much what the springs give varies over its sweep (rad)
 
 
@@ -100,14 +90,6 @@ _CHECK_IT = "is another servo on its channel? Look with armcal servo --check"
 
 @dataclass(eq=False)
 class _Sweep:
-    """What was observed of a joint, and the table that explains it so far.
-
-    Attributes:
-        pulses: of the table at the servo's knots (counts).
-        kept: which lines count.
-        radius: by which an angle about the joint becomes what is compared: of its circle (m), or one.
-    """
-
     known: KnownServo
     lines: Sequence[Entry]
     by: str
@@ -115,9 +97,9 @@ class _Sweep:
     sds: Array  # of the angle (rad)
     axis: Array  # of the joint, by the model (base frame)
     arms: Array  # from the axis to the body (N x 3, m)
-    pulses: Array
-    kept: Mask
-    radius: float = 1.0
+    pulses: Array  # of the table at the servo's knots (counts)
+    kept: Mask  # which lines count
+    radius: float = 1.0  # by which an angle becomes what is compared: of its circle (m), or one
 
     @property
     def counts(self) -> Array:
@@ -129,12 +111,10 @@ class _Sweep:
 
     @property
     def approaches(self) -> Array:
-        """From where the angle came: 1 from below."""
         return np.array([float(line["came"]) for line in self.lines]) * (-1 if self.falls else 1)
 
     @property
     def angles(self) -> Array:
-        """Where the table puts the pulses (rad)."""
         rising = slice(None, None, -1 if self.falls else 1)
         return np.asarray(piecewise(self.pulses[rising], self.known.angles[rising])(self.counts))
 
@@ -160,7 +140,6 @@ class _Sweep:
 def outcome_of(
     entries: Sequence[Entry],
     servos: Sequence[KnownServo],
-    clocks: Mapping[str, PulseClock],
     experiment: Experiment,
     arm: Arm,
     settings: ServoCalibrationSettings,
@@ -173,28 +152,41 @@ def outcome_of(
     left_out = permuted(entries, [servo.joint for servo in servos], rigid)
     while True:
         remaining = [servo for servo in servos if servo.joint not in left_out]
-        swept = {servo.joint: _sweep_of(entries, servo, clocks, rigid, settings) for servo in remaining}
+        swept = {servo.joint: _sweep_of(entries, servo, rigid, settings) for servo in remaining}
         silent = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, str)}
         sweeps = {joint: sweep for joint, sweep in swept.items() if isinstance(sweep, _Sweep)}
-        outcome = _fitted(sweeps, clocks, rigid, experiment, arm, settings)
-        worst = max(outcome.servos.values(), key=lambda servo: servo.scatter, default=None)
+        by_eye = {joint: sweep for joint, sweep in sweeps.items() if sweep.by == "somebody"}
+        keeps_zero = settings.zero == "kept" and not by_eye
+        fitted: dict[str, FittedServo] = {}
+        unfit: dict[str, str] = {}
+        compliances: dict[str, tuple[float, float]] = {}
+        spans: dict[str, float] = {}
+        for by in ("rotation", "position"):
+            if own := {joint: sweep for joint, sweep in sweeps.items() if sweep.by == by}:
+                fit = _TableFit(own, rigid, experiment, settings, keeps_zero)
+                unfit |= fit.run()
+                fitted |= {joint: fit.servo(joint) for joint in own if joint not in unfit}
+                compliances |= fit.compliances()
+                spans |= fit.sag_spans()
+        fitted |= {joint: _by_eye(sweep) for joint, sweep in by_eye.items()}
+        worst = max(fitted.values(), key=lambda servo: servo.scatter, default=None)
         if worst is None or worst.scatter <= _MOST_SCATTER:
-            return replace(outcome, silent={**outcome.silent, **silent, **left_out})
+            break
         left_out[worst.known.joint] = (
             f"the spread of its angles is {math.degrees(worst.scatter):.1f} deg, as if it slipped, or "
             "was too hot and let go"
         )
+    if settings.sag != "fitted":
+        compliances = {}
+    known = {name: change for name, change in compliances.items() if change[1] < _DETERMINED * settings.sag_sd}
+    undetermined = tuple(name for name in compliances if name not in known)
+    return Outcome(fitted, {**unfit, **silent, **left_out}, known, undetermined, keeps_zero, spans)
 
 
 def _sweep_of(
-    entries: Sequence[Entry],
-    servo: KnownServo,
-    clocks: Mapping[str, PulseClock],
-    rigid: RigidArm,
-    settings: ServoCalibrationSettings,
+    entries: Sequence[Entry], servo: KnownServo, rigid: RigidArm, settings: ServoCalibrationSettings
 ) -> _Sweep | str:
-    """A joint's lines and a first table, or why they show none."""
-    joint, tick = servo.joint, clocks[servo.board].tick
+    joint, tick = servo.joint, servo.clock.tick
     lines = [e for e in entries if e["kind"] == POSE and e["joint"] == joint]
     seen = list({(e["target"], e["came"]): e for e in entries if e["kind"] == ANGLE and e["joint"] == joint}.values())
     stated = servo.pulses_at(servo.angles) / tick
@@ -204,8 +196,10 @@ def _sweep_of(
         poses, everything = np.tile(np.eye(4), (len(seen), 1, 1)), np.ones(len(seen), dtype=bool)
         sds, nowhere = np.array([line["sd"] for line in seen]), np.zeros((len(seen), 3))
         return _Sweep(servo, seen, "somebody", poses, sds, np.zeros(3), nowhere, stated, everything)
-    others = _others(lines, joint)
-    axis, origin = rigid.axis(joint, {**others, joint: 0.0})
+    # Where the joints stood: of the others the median, since each had the same pulse every time.
+    names = sorted({name for line in lines for name in line["told"]})
+    stood = {n: float(np.median([line["told"][n] for line in lines if n in line["told"]])) for n in names}
+    axis, origin = rigid.axes({**stood, joint: 0.0})[joint]
     poses = np.tile(np.eye(4), (len(lines), 1, 1))
     poses[:, :3, 3] = [line["position"] for line in lines]
     by = "position" if any(line["rotation"] is None for line in lines) else "rotation"
@@ -213,9 +207,8 @@ def _sweep_of(
     deviations = np.array([[d or 0.0 for d in line["deviations"]] for line in lines])
     arms, radius = poses[:, :3, 3] - origin, 1.0
     counts = np.array([line["counts"] for line in lines])
-    table = PulseTable(servo.table.angles, servo.table.pulses)
-    commanded = np.array([float(table.angle(count * tick)) for count in counts])
-    middle = int(np.argmin(np.abs(commanded - others.get(joint, 0.0))))
+    commanded = np.array([float(servo.table.angle(count * tick)) for count in counts])
+    middle = int(np.argmin(np.abs(commanded)))
     if by == "rotation":
         turns = Rotation.from_matrix(poses[:, :3, :3] @ poses[middle, :3, :3].T)
         turned = twist_angles(turns, axis)
@@ -241,44 +234,8 @@ def _sweep_of(
     return sweep if sweep.is_table else _NO_TABLE
 
 
-def _others(lines: Sequence[Entry], joint: str) -> dict[str, float]:
-    """Where the other joints stood: the median, since each had the same pulse every time."""
-    names = sorted({name for line in lines for name in line["told"]})
-    return {n: float(np.median([line["told"][n] for line in lines if n in line["told"]])) for n in names if n != joint}
-
-
-def _fitted(
-    sweeps: Mapping[str, _Sweep],
-    clocks: Mapping[str, PulseClock],
-    rigid: RigidArm,
-    experiment: Experiment,
-    arm: Arm,
-    settings: ServoCalibrationSettings,
-) -> Outcome:
-    """Sweeps of a tracker's rotations have a problem, and those of its positions; what somebody saw needs no model."""
-    tracked = all(sweep.by != "somebody" for sweep in sweeps.values())
-    zero: Zero = "kept" if settings.zero == "kept" and tracked else "measured"
-    servos: dict[str, FittedServo] = {}
-    silent: dict[str, str] = {}
-    compliances: dict[str, tuple[float, float]] = {}
-    spans: dict[str, float] = {}
-    for by in ("rotation", "position"):
-        if own := {joint: sweep for joint, sweep in sweeps.items() if sweep.by == by}:
-            fit = _TableFit(own, rigid, experiment, arm, settings, zero, clocks)
-            silent |= fit.run()
-            servos |= {joint: fit.servo(joint) for joint in own if joint not in silent}
-            compliances |= fit.compliances()
-            spans |= fit.sag_spans()
-    by_eye = {joint: sweep for joint, sweep in sweeps.items() if sweep.by == "somebody"}
-    servos |= {joint: _by_eye(sweep, clocks[sweep.known.board].tick) for joint, sweep in by_eye.items()}
-    known = {name: change for name, change in compliances.items() if change[1] < _DETERMINED * settings.sag_sd}
-    fitted = settings.sag == "fitted"
-    undetermined = tuple(name for name in compliances if name not in known and fitted)
-    return Outcome(servos, clocks, silent, known if fitted else {}, undetermined, zero, spans)
-
-
-def _by_eye(sweep: _Sweep, tick: float) -> FittedServo:
-    """A table of straight lines through the pulses at which somebody saw angles (``tick`` in s)."""
+def _by_eye(sweep: _Sweep) -> FittedServo:
+    """A table of straight lines through the pulses at which somebody saw angles."""
     knots, targets = sweep.known.angles, np.array([line["target"] for line in sweep.lines])
     stated, hats = sweep.known.pulses_at(knots), piecewise(knots, np.eye(len(knots)))
     steep = piecewise(knots, stated).derivative()(targets)
@@ -286,7 +243,7 @@ def _by_eye(sweep: _Sweep, tick: float) -> FittedServo:
     has_lag = len(np.unique(came)) > 1
     columns = np.column_stack([hats(targets), *([steep * came] if has_lag else [])])
     weak = np.eye(len(knots), columns.shape[1]) / (WEAK_SD * np.abs(np.gradient(stated, knots)))[:, None]
-    pulses, kept, scale = sweep.counts * tick, sweep.kept, 1.0
+    pulses, kept = sweep.counts * sweep.known.clock.tick, sweep.kept
     for _ in range(3):
         weights = kept / (sweep.sds * np.abs(steep))
         rows = np.vstack([columns * weights[:, None], weak])
@@ -333,29 +290,31 @@ def _fitted_servo(
 
 
 class _TableFit:
-    """Sweeps that the same of the body shows, fitted together."""
-
     def __init__(
         self,
         sweeps: dict[str, _Sweep],
         rigid: RigidArm,
         experiment: Experiment,
-        arm: Arm,
         settings: ServoCalibrationSettings,
-        zero: Zero,
-        clocks: Mapping[str, PulseClock],
+        keeps_zero: bool,
     ) -> None:
-        self._ticks = {joint: clocks[sweep.known.board].tick for joint, sweep in sweeps.items()}
-        self._sweeps, self._rigid, self._arm, self._settings = sweeps, rigid, arm, settings
+        self._sweeps, self._settings, self._keeps_zero = sweeps, settings, keeps_zero
+        self._arm = arm = rigid.arm
         self._by = next(iter(sweeps.values())).by
-        self._keeps_zero = zero == "kept"
         self._numbers = {joint: arm.joint_names.index(joint) + 1 for joint in sweeps}
         lags = [self._numbers[j] for j, s in sweeps.items() if len(np.unique(s.approaches)) > 1]
         self._lags = {joint for joint, number in self._numbers.items() if number in lags}
         knots = {self._numbers[joint]: sweep.known.angles.tolist() for joint, sweep in sweeps.items()}
         corrections = Corrections(knots, list(self._numbers.values()), lags)
         by: Literal["rotation", "position"] = "position" if self._by == "position" else "rotation"
-        seat = quaternion_of(mean_rotation(self._seats())) if self._by == "rotation" else NO_TURN
+        seat: tuple[float, ...] = NO_TURN
+        if self._by == "rotation":  # on the nominal tool, the mean of all lines
+            seats = [
+                rigid.tool({**line["told"], joint: angle})[:3, :3].T @ pose[:3, :3]
+                for joint, sweep in sweeps.items()
+                for line, angle, pose in zip(sweep.lines, sweep.angles, sweep.poses, strict=True)
+            ]
+            seat = quaternion_of(mean_rotation(np.array(seats)))
         body = Body((arm.name,), by, seat, sweeps=len(sweeps))
         has_springs = settings.sag != "none"
         free = self._free(experiment, body, corrections, has_springs)
@@ -366,15 +325,12 @@ class _TableFit:
         self._compliances = [name for name in free if name.startswith(f"{arm.name}.") and name in names]
 
     def _zeroed(self, joint: str) -> float:
-        """By how much the angles of a first table are beyond those by which its pulse at zero is the stated one (rad).
-
-        The table is moved by that, where zeros are kept.
-        """
+        """How far a first table's angles are beyond those by which its zero is kept (rad); it is moved by that."""
         sweep = self._sweeps[joint]
         if not self._keeps_zero:
             return 0.0
         knots, rising = sweep.known.angles, slice(None, None, -1 if sweep.falls else 1)
-        stated = float(sweep.known.pulses_at(np.zeros(1))[0]) / self._ticks[joint]
+        stated = float(sweep.known.pulses_at(np.zeros(1))[0]) / sweep.known.clock.tick
         beyond = float(piecewise(sweep.pulses[rising], knots[rising])(stated))
         sweep.pulses = np.asarray(piecewise(knots - beyond, sweep.pulses)(knots))
         return beyond
@@ -411,16 +367,6 @@ class _TableFit:
             free[f"{BODY}.seat_rotation"] = None
         return free
 
-    def _seats(self) -> Array:
-        """How the body sits on the nominal tool, line by line."""
-        return np.array(
-            [
-                self._rigid.tool({**line["told"], joint: angle})[:3, :3].T @ pose[:3, :3]
-                for joint, sweep in self._sweeps.items()
-                for line, angle, pose in zip(sweep.lines, sweep.angles, sweep.poses, strict=True)
-            ]
-        )
-
     def _seen(self) -> Dataset:
         joints = list(self._arm.commanded)
         rows: dict[str, list[Array]] = {joint: [] for joint in joints}
@@ -439,12 +385,10 @@ class _TableFit:
         return body_dataset(self._arm.name, angles, poses, (noise, noise), approaches, numbers)
 
     def _parts(self, rows: Array) -> dict[str, Array]:
-        """Columns of all records, joint by joint."""
         ends = np.cumsum([len(sweep.lines) for sweep in self._sweeps.values()])[:-1]
         return dict(zip(self._sweeps, np.split(rows, ends, axis=-1), strict=True))
 
     def run(self) -> dict[str, str]:
-        """Until the tables are steady; why some joints have none."""
         silent: dict[str, str] = {}
         for _ in range(_ROUNDS):
             for _ in range(2):  # without what lies far off, and with what does so no longer
@@ -489,12 +433,10 @@ class _TableFit:
         return np.asarray(hats(0.0) if self._keeps_zero else hats(sweep.angles).mean(axis=0))
 
     def _off(self) -> dict[str, Array]:
-        """What is left of each angle (rad)."""
         parts = self._parts(self._fit.residuals())
         return {joint: sweep.along(parts[joint]) for joint, sweep in self._sweeps.items()}
 
     def servo(self, joint: str) -> FittedServo:
-        """By the last fit; pulses by the stated oscillator."""
         sweep, names, off = self._sweeps[joint], self._names(joint), self._off()[joint]
         sizes = (off / sweep.sds)[sweep.kept]
         freedom = len(sizes) - len(names) - (joint in self._lags) - 1
@@ -508,7 +450,7 @@ class _TableFit:
             name = f"{self._arm.name}.{TABLES}.lag{self._numbers[joint]}"
             lag = self._fit.value(name), float(self._fit.deviations([name])[0]) * max(1.0, scale)
         angles = sweep.angles + shift - (lag[0] or 0.0) * sweep.approaches
-        tick = self._ticks[joint]
+        tick = sweep.known.clock.tick
         return _fitted_servo(sweep, pulses * tick, sds * tick, lag, off, scale, angles)
 
     def _absolute(self, joint: str) -> float:
@@ -533,3 +475,210 @@ class _TableFit:
         stiff = self._fit.residuals(dict.fromkeys(self._compliances, 0.0)) - self._fit.residuals()
         parts = self._parts(stiff)
         return {joint: float(np.ptp(sweep.along(parts[joint]))) for joint, sweep in self._sweeps.items()}
+
+
+_FAR_CHANGE = 0.1
+_SAG_WORTH = math.radians(0.1)
+
+
+def is_usable(servo: FittedServo) -> bool:
+    try:
+        PulseTable(servo.angles, servo.pulses)
+    except ValueError:
+        return False
+    return True
+
+
+def findings(outcome: Outcome) -> list[str]:
+    texts = [f"{joint}: the table is left as it was: {why}." for joint, why in outcome.silent.items()]
+    texts += [text for servo in outcome.servos.values() for text in _of_servo(servo)]
+    if outcome.keeps_zero:
+        texts.append("zeros: each servo's pulse at 0 deg was kept; the angles were measured from one another.")
+    if all(servo.by == "somebody" for servo in outcome.servos.values()):
+        return texts
+    worst = max(outcome.sag_span, key=lambda joint: outcome.sag_span[joint], default="")
+    if not worst or not outcome.sag_span[worst]:
+        texts.append(
+            "springs: the model has no deflection of the arm under its weight; the tables contain it. Give the springs "
+            "their compliances, or bench.servo.sag: fitted."
+        )
+    elif outcome.sag_span[worst] >= _SAG_WORTH:
+        how = "found with the tables" if outcome.compliances or outcome.undetermined else "the model's"
+        texts.append(
+            f"springs: over a sweep they turn the tool by up to {math.degrees(outcome.sag_span[worst]):.1f} deg "
+            f"({worst}); that is taken out by compliances that are {how}."
+        )
+    return texts
+
+
+def _of_servo(servo: FittedServo) -> Iterator[str]:
+    joint = servo.known.joint
+    if not is_usable(servo):
+        yield (
+            f"{joint}: the pulses found neither rise nor fall with the angle: the table is left as it was. "
+            "Look at its linkage."
+        )
+        return
+    before, after = (np.sign(pulses[-1] - pulses[0]) for pulses in (servo.known.table.pulses, servo.pulses))
+    if before != after:
+        yield (
+            f"{joint}: the servo turns the other way than its table said, or the tracker's frame is left-handed: "
+            "look which way it turns."
+        )
+    for angle, is_determined in zip(servo.angles, servo.determined, strict=True):
+        beyond = max(servo.reach[0] - angle, angle - servo.reach[1])
+        if not is_determined:
+            yield f"{joint}: no measurement determines the pulse at {math.degrees(angle):g} deg; it is the stated one."
+        elif beyond > math.radians(15):
+            yield (
+                f"{joint}: the pulse at {math.degrees(angle):g} deg is extrapolated linearly from "
+                "the measured range, "
+                f"{math.degrees(servo.reach[0]):.0f} to {math.degrees(servo.reach[1]):.0f} deg."
+            )
+    stated = servo.known.pulses_at(np.array(servo.angles))
+    change = float(np.max(np.abs(np.diff(servo.pulses) / np.diff(stated) - 1.0)))
+    if before == after and change > _FAR_CHANGE:
+        yield (
+            f"{joint}: its pulses a degree differ from the stated ones by {100 * change:.0f} %: is it the "
+            "servo that was meant, and does the tracker follow this arm's tool?"
+        )
+    if servo.lag is None:
+        yield f"{joint}: it was approached from one side only, so its backlash is not known."
+    elif servo.lag < -3 * servo.lag_sd and servo.lag < -math.radians(0.05):
+        over = -math.degrees(servo.lag)
+        yield f"{joint}: it overshoots by {over:.2f} deg rather than lags: does it stand before it is measured?"
+    if servo.scale > 3:
+        yield (
+            f"{joint}: the spread of the angles is {math.degrees(servo.scatter):.2f} deg, {servo.scale:.0f} times the "
+            "stated one; the deviations are enlarged by that."
+        )
+    for counts, angle in servo.outliers:
+        yield f"{joint}: the angle at {counts} counts ({math.degrees(angle):.1f} deg) lies far off and was set aside."
+
+
+RESULTS = "servo.json"
+_APART = math.radians(0.5)  # Knots that are nearer to the end of a shortened table add nothing
+
+
+def improved(file: ServoFile, outcome: Outcome, adapter: str = "") -> ServoFile:
+    """The servo file with the fitted tables, within pulse ranges; boards without an adapter get that of the record."""
+    stated = {"id": adapter}
+    boards = {name: board if board.id else board.model_copy(update=stated) for name, board in file.boards.items()}
+    servos = dict(file.servos)
+    for joint, servo in file.servos.items():
+        if joint in outcome.servos and (table := _table(outcome, joint, file)) is not None:
+            servos[joint] = servo.model_copy(update={"angles": table.angles, "pulses": table.pulses})
+    return ServoFile(boards, servos)
+
+
+def _table(outcome: Outcome, joint: str, file: ServoFile) -> PulseTable | None:
+    """The part of a fitted table whose pulses (s) servo and board allow; None where nothing is left."""
+    fitted, servo = outcome.servos[joint], file.servos[joint]
+    if not is_usable(fitted):
+        return None
+    # Counts stay what they are: the file's board may have another oscillator than that of the record.
+    same = fitted.known.clock.oscillator_hz / file.boards[servo.board].oscillator_hz
+    table = PulseTable(fitted.angles, tuple(round(pulse * same, 9) for pulse in fitted.pulses))
+    allowed, longest = servo.pulse_range, file.boards[servo.board].clock.longest_pulse
+    low, high = max(allowed[0], min(table.pulses)), min(allowed[1], longest, max(table.pulses))
+    if (low, high) == (min(table.pulses), max(table.pulses)):
+        return table
+    if not low < high:
+        return None
+    ends = sorted((float(table.angle(pulse)), pulse) for pulse in (low, high))
+    pairs = list(zip(table.angles, table.pulses, strict=True))
+    inner = [(a, p) for a, p in pairs if low < p < high and ends[0][0] + _APART < a < ends[1][0] - _APART]
+    return PulseTable(*map(tuple, zip(ends[0], *inner, ends[1], strict=True)))
+
+
+def write_servo_file(path: Path, file: ServoFile) -> Path | None:
+    """Put a servo file in place whole, and keep the one before, whose place is given; None if nothing changed.
+
+    Of a part that stands on one line, as armcal writes it, only that line changes, up to its comment. Where a part
+    stands otherwise, the whole file is written anew.
+    """
+    path = path.resolve()  # of a link, what it leads to
+    with writing(path, "Make it writable and give the command again: nothing measured is lost."):
+        before = path.read_bytes()
+        if not path.stat().st_mode & 0o222:
+            raise PermissionError(errno.EACCES, "it is read-only")
+        stated = load_servo_file(path)
+        if stated == file:
+            return None
+        kept = next_name(path)
+        write_whole(kept, before)
+        write_whole(path, _text_of(before.decode(), stated, file).encode())
+    return kept
+
+
+def _text_of(text: str, stated: ServoFile, file: ServoFile) -> str:
+    was, now = servo_file_text(stated).splitlines(), servo_file_text(file).splitlines()
+    for before, after in zip(was, now, strict=True):
+        if before != after:
+            name = re.escape(after.partition(": {")[0])
+            places = list(re.finditer(rf"(?m)^{name}: \{{[^{{}}&*\n]*\}}(?=[ \t]*(#.*)?$)", text))
+            if len(places) != 1:
+                return servo_file_text(file)
+            text = f"{text[: places[0].start()]}{after}{text[places[0].end() :]}"
+    return text
+
+
+def results(outcome: Outcome, changed: ServoFile) -> dict[str, Any]:
+    written = {joint: _table(outcome, joint, changed) is not None for joint in outcome.servos}
+    texts = findings(outcome)
+    for joint, fitted in outcome.servos.items():
+        servo, stated = changed.servos[joint], fitted.known.table.angles
+        meant = min(stated[0], fitted.angles[0]), max(stated[-1], fitted.angles[-1])
+        if not written[joint]:
+            if is_usable(fitted):
+                texts.append(
+                    f"{joint}: the table is left as it was: no pulse that was found is in the servo's pulse_range."
+                )
+        elif servo.angles[0] > meant[0] + _APART or servo.angles[-1] < meant[1] - _APART:
+            low, high = (1e6 * pulse for pulse in servo.pulse_range)
+            shortened = (fitted.angles[0], fitted.angles[-1]) != (servo.angles[0], servo.angles[-1])
+            why = f"the servo's pulse_range is {low:g} to {high:g} us" if shortened else "bench.servo.knots ends there"
+            texts.append(
+                f"{joint}: its table reaches from {math.degrees(servo.angles[0]):.1f} to "
+                f"{math.degrees(servo.angles[-1]):.1f} deg, not from {math.degrees(meant[0]):.1f} to "
+                f"{math.degrees(meant[1]):.1f} deg: {why}."
+            )
+    return {
+        "servos": {joint: {**_servo(servo), "written": written[joint]} for joint, servo in outcome.servos.items()},
+        "compliances_rad_per_Nm": {name: {"value": v, "sd": sd} for name, (v, sd) in outcome.compliances.items()},
+        "not_told": {"servos": dict(outcome.silent), "compliances": list(outcome.undetermined)},
+        "findings": texts,
+    }
+
+
+def write_results(folder: Path, summary: Mapping[str, Any]) -> None:
+    with writing(folder, "Give another --out."):
+        write_whole(folder / RESULTS, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _servo(servo: FittedServo) -> dict[str, Any]:
+    stated = servo.known.pulses_at(np.array(servo.angles))
+    slopes = np.gradient(np.array(servo.pulses), np.array(servo.angles))  # by a knot's neighbours (s/rad)
+    slopes[np.abs(slopes) <= 1e-9] = math.nan
+    columns = (servo.angles, servo.pulses, servo.pulse_sds, servo.determined, stated.tolist(), slopes.tolist())
+    return {
+        "board": servo.known.board,
+        "knots": [
+            {
+                "angle_deg": math.degrees(angle),
+                "pulse_us": 1e6 * pulse,
+                "sd_us": finite(1e6 * sd),
+                "told": is_determined,
+                "before_us": 1e6 * before,
+                "change_us": 1e6 * (pulse - before),
+                "change_deg": math.degrees((before - pulse) / slope),
+            }
+            for angle, pulse, sd, is_determined, before, slope in zip(*columns, strict=True)
+        ],
+        "backlash_deg": None if servo.lag is None else 2 * math.degrees(servo.lag),
+        "backlash_sd_deg": finite(2 * math.degrees(servo.lag_sd)),
+        "scatter_deg": math.degrees(servo.scatter),
+        "observations": servo.used,
+        "set_aside": len(servo.outliers),
+        "seen_by": servo.by,
+    }

@@ -1,18 +1,17 @@
 """What a servo calibration is about: the servos of a file, the arm that they move, and where it may go."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from armcal.arm.joints import unknown_joint
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.base.arrays import Array
-from armcal.base.dataset import Dataset
 from armcal.base.settings import Angle, Compliance, Duration, InputPath, Length, Settings, UnitOf
 from armcal.config.servo_file import ServoFile, load_servo_file
 from armcal.config.validate import validate
@@ -22,28 +21,24 @@ from armcal.devices.device import (
     DeviceRefusedError,
     DeviceState,
     JointDevice,
-    PulseDevice,
     open_device,
     state_of,
 )
 from armcal.devices.wiring import servo_file_of
-from armcal.errors import ConfigError
+from armcal.errors import ConfigError, DataError, InputError, Location
+from armcal.io.journal import JOURNAL, Journal, KeptJournal, has_journal
+from armcal.io.plain_files import writing
 from armcal.run.experiment import Experiment
 from pydantic import Field, model_validator
 from scipy.interpolate import BSpline, make_interp_spline
 from typing_extensions import override
 
-from armcal_bench.acquisition.drive import PathPlanner
-from armcal_bench.acquisition.heat import HeatModel
-from armcal_bench.acquisition.preparation import Prepared, clearance_of, heat_of, of_poses, run_limits
-from armcal_bench.acquisition.run_log import Progress
-from armcal_bench.acquisition.session import RunOptions
-from armcal_bench.acquisition.settings import AcquisitionSettings, ArrivalSettings
-from armcal_bench.acquisition.tracker_monitor import Waits
-from armcal_bench.bench import SECTION, Bench
-from armcal_bench.hazards import FirstMotion, HazardJudge
-from armcal_bench.keys import OperatorInput
-from armcal_bench.servo.tracked_body import RigidArm
+from armcal_bench.bench import SECTION, AcquisitionSettings, ArrivalSettings, Bench
+from armcal_bench.drive import PathPlanner
+from armcal_bench.preparation import Prepared, clearance_of, of_poses, run_limits
+from armcal_bench.run_log import LEFT_OUT as PASSED
+from armcal_bench.run_log import MEASURED, Log, Progress
+from armcal_bench.tracked_body import RigidArm
 
 PositiveAngle = Annotated[Angle, Field(gt=0)]
 PositiveDuration = Annotated[Duration, Field(gt=0)]
@@ -52,40 +47,26 @@ PulseRange = Annotated[tuple[float, float], UnitOf("time")]
 
 
 class ServoCalibrationSettings(Settings):
-    """What ``armcal servo`` measures, and how. When the arm stands is as in ``acquisition.settle``.
-
-    Attributes:
-        knots: the angles that all tables are to be given at; without them each table keeps its own, and its ends reach
-            as far as the joint is measured.
-        base: where the other joints stand while one is measured; joints that are not named stand at zero.
-        ranges: over which joints are moved; the limits of ``acquisition`` or ``plan`` where none are given here.
-        approach: how far a joint comes from below or above before it is measured, so that its play is taken up.
-        pulses: no pulse outside this range is ever set, nor one outside the servo's own ``pulse_range``.
-        rate_deg_per_s: the fastest that a joint is moved, by its stated table.
-        zero: ``kept``: each servo's pulse at zero stays; ``model``: angles are absolute, by the model and the tracker.
-        sag: what springs give is taken from the model's compliances, fitted with the tables, or not reckoned with.
-        sag_sd: how far compliances may well be from the model's, where they are fitted.
-        silence: after this silence of the host a board that can brings the arm back to the base pose.
-    """
+    """What ``armcal servo`` measures, and how. When the arm stands is as in ``acquisition.settle``."""
 
     servos: InputPath | None = None  # the servo file to improve; the device's own where it is not given
     joints: tuple[str, ...] = ()  # those to calibrate; all of the servo file
-    knots: Angles = ()
-    base: dict[str, Angle] = Field(default_factory=dict)
-    ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
+    knots: Angles = ()  # of all tables; without them each keeps its own, its ends as far as the joint is measured
+    base: dict[str, Angle] = Field(default_factory=dict)  # where joints stand while another is measured; others at zero
+    ranges: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)  # else the limits of the run
     step: PositiveAngle = math.radians(10)  # between the angles of a sweep, or of a guided calibration
-    approach: PositiveAngle = math.radians(4)
-    pulses: PulseRange = (500e-6, 2600e-6)
+    approach: PositiveAngle = math.radians(4)  # from how far a joint comes, so that its play is taken up
+    pulses: PulseRange = (500e-6, 2600e-6)  # no other is ever set, nor one outside the servo's ``pulse_range``
     rate_deg_per_s: Annotated[float, Field(gt=0, le=60)] = 20.0
     period: PositiveDuration = 0.02  # between two steps of a motion
-    zero: Literal["kept", "model"] = "kept"
-    sag: Literal["none", "model", "fitted"] = "fitted"
-    sag_sd: Annotated[Compliance, Field(gt=0)] = 0.2
+    zero: Literal["kept", "model"] = "kept"  # the pulse at zero stays, or angles are absolute by model and tracker
+    sag: Literal["none", "model", "fitted"] = "fitted"  # which compliances give what the springs take out
+    sag_sd: Annotated[Compliance, Field(gt=0)] = 0.2  # how far fitted ones may well be from the model's
     rotation_sd: PositiveAngle = math.radians(0.03)  # of a settled rotation about an axis
     least_radius: Length = 0.03  # of a circle that shows an angle, where a tracker sees positions only
     guided_sd: PositiveAngle = math.radians(0.5)  # how well a joint is put at an angle by eye
     check: PositiveAngle = math.radians(10)  # how far ``--check`` moves a joint
-    silence: PositiveDuration = 1.0
+    silence: PositiveDuration = 1.0  # of the host, after which a board that can goes back to the base pose
 
     @model_validator(mode="after")
     def _usable(self) -> Self:
@@ -99,38 +80,12 @@ class ServoCalibrationSettings(Settings):
         return self
 
 
-ReportProgress = Callable[[str, int, int], None]  # Takes the joint, and how many of its points are done and planned
-
-
-@dataclass(frozen=True)
-class Conversation:
-    """How a calibration speaks with whom it is for.
-
-    Attributes:
-        may_energise: whether the arm may be moved; called once before anything moves, with what is
-            about to move and what is dangerous in it.
-    """
-
-    asked_to_stop: Callable[[], bool]  # whether somebody wants it to hold and end
-    may_energise: Callable[[FirstMotion], bool]
-    report: ReportProgress  # takes how far a tracked calibration is
-    say: Callable[[str], None]  # takes a line, of a guided one
-    operator: Callable[[], AbstractContextManager[OperatorInput]]  # what somebody types, while it is asked for
-    waits: Waits = field(default_factory=Waits)  # says what is waited for
-
-    def options(self, on_progress: Callable[[Progress], None] = lambda progress: None) -> RunOptions:
-        """Those of a measuring run, of which a calibration is one."""
-        stop, may = self.asked_to_stop, self.may_energise
-        return RunOptions(Path(), "anew", stop, may, on_progress, unchecked=True, when_stopped="hold", waits=self.waits)
-
-
 @dataclass(frozen=True)
 class KnownServo:
-    """A servo as its table states it."""
-
     joint: str  # that it turns
     board: str  # that drives it
     table: PulseTable  # as stated; pulses by the board's oscillator
+    clock: PulseClock  # of the board
     knots: tuple[float, ...] = ()  # angles (rad) that the table is to be given at; empty: those of the stated one
 
     @property
@@ -138,7 +93,6 @@ class KnownServo:
         return np.array(self.knots or self.table.angles)
 
     def pulses_at(self, angles: Array) -> Array:
-        """The stated table's pulses (s) at angles (rad)."""
         return np.asarray(piecewise(np.array(self.table.angles), np.array(self.table.pulses))(angles))
 
 
@@ -154,8 +108,6 @@ ANYWHERE = ArrivalSettings.si(astray=100.0, astray_turned=2 * math.pi)
 
 @dataclass(frozen=True)
 class Setup:
-    """All that is known before anything moves."""
-
     bench: Bench  # the configured one
     settings: ServoCalibrationSettings  # of the calibration
     path: Path  # of the servo file
@@ -164,17 +116,10 @@ class Setup:
     base: Mapping[str, float]  # where every servo's joint stands while others are measured (rad)
     ranges: Mapping[str, tuple[float, float]]  # over which each joint may be moved from there (rad)
     nominal: RigidArm  # the arm by its model
-    heat: HeatModel  # of the servos
     planner: PathPlanner  # of straight ways on which nothing comes too near, if that is stated
-    judge: HazardJudge  # of what is dangerous in the first motions
 
     @classmethod
     def of(cls, experiment: Experiment) -> Self:
-        """Of an experiment's bench.
-
-        Raises:
-            ConfigError: the bench, its servo section or the servo file is refused, or the base pose is not clear.
-        """
         bench = Bench.of(experiment)
         settings = ServoCalibrationSettings()
         if bench.settings.servo is not None:
@@ -190,34 +135,30 @@ class Setup:
         file = load_servo_file(path)
         arm = bench.arm
         moved = tuple(joint for joint in arm.commanded if joint in file.servos)
-        _check_names(experiment, settings, file, moved)
+        for key in ("joints", "base", "ranges"):
+            if fault := unknown_joint(getattr(settings, key), moved):
+                where = experiment.source.where((*AT, key))
+                raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
+        if not moved:
+            text = "the servo file has no servo of a joint of this arm."
+            hint = f"Name them as the joints: {', '.join(file.servos)} are not in the model."
+            raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
         stated = settings.base or bench.settings.acquisition.park
         base = {joint: stated.get(joint, 0.0) for joint in moved}
         limited = {**bench.settings.acquisition.limits, **settings.ranges}
         acquisition = bench.settings.acquisition.model_copy(update={"limits": limited})
         limits = dict(zip(arm.commanded, run_limits(experiment, acquisition, arm).tolist(), strict=True))
-        nominal = RigidArm(arm, experiment.parameters)
-        heat = heat_of(experiment, bench.settings.acquisition, arm)
-        ends = np.array(list(limits.values()))
+        ends, nominal = np.array(list(limits.values())), RigidArm(arm, experiment.parameters)
         planner = PathPlanner(clearance_of(experiment, arm), ends, np.zeros((0, len(limits))), _LOOK_STEP)
-        rest = np.array([base.get(joint, 0.0) for joint in arm.commanded])
-        judge = HazardJudge(tuple(arm.commanded), moved, ends, heat.torques, rest)
-        setup = cls(bench, settings, path, file, settings.joints or moved, base, {}, nominal, heat, planner, judge)
+        setup = cls(bench, settings, path, file, settings.joints or moved, base, {}, nominal, planner)
         return replace(setup, ranges=setup._clear_ranges(experiment, limits))
 
     def known(self, joint: str) -> KnownServo:
         servo = self.file.servos[joint]
-        return KnownServo(joint, servo.board, servo.table, self.knots_of(joint))
-
-    def table_of(self, joint: str) -> tuple[PulseTable, PulseClock]:
-        servo = self.file.servos[joint]
-        return servo.table, self.file.boards[servo.board].clock
+        return KnownServo(joint, servo.board, servo.table, self.file.boards[servo.board].clock, self.knots_of(joint))
 
     def knots_of(self, joint: str) -> tuple[float, ...]:
-        """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range.
-
-        So the table of a servo that turns farther than the others is not cut to theirs.
-        """
+        """Angles (rad) that a table is to be given at: as configured, else its own; its ends reach over the range."""
         if self.settings.knots:
             return self.settings.knots
         stated, (low, high) = self.file.servos[joint].angles, self.ranges[joint]
@@ -226,22 +167,12 @@ class Setup:
         return (ends[0], *inner, ends[1])
 
     def pulses_of(self, joint: str) -> tuple[float, float]:
-        """The shortest and the longest pulse (s) that may be set: the servo's range, and what is configured."""
         borne, allowed = self.file.servos[joint].pulse_range, self.settings.pulses
         return max(borne[0], allowed[0]), min(borne[1], allowed[1])
-
-    @property
-    def clocks(self) -> dict[str, PulseClock]:
-        return {name: board.clock for name, board in self.file.boards.items()}
 
     def _clear_ranges(
         self, experiment: Experiment, limits: Mapping[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
-        """How far each joint may go from the base pose, within its limits and table and without coming too near.
-
-        Raises:
-            ConfigError: the base pose is not allowed; half of the joints in it would be worse than none.
-        """
         where = experiment.source.where((*AT, "base"))
         for joint, angle in self.base.items():
             (shortest, longest), pulse = self.pulses_of(joint), float(self.file.servos[joint].table.pulse(angle))
@@ -283,55 +214,37 @@ class Setup:
         return self.bench.settings.acquisition.model_copy(update=changes)
 
     def run(
-        self, device: "PulsedJoints", poses: Mapping[str, tuple[Mapping[str, float], Mapping[str, int]]]
+        self,
+        device: "PulsedJoints",
+        poses: Mapping[str, Mapping[str, float]],
+        sides: Mapping[str, Mapping[str, int]] = MappingProxyType({}),
     ) -> Prepared:
         """A run through poses by id: where joints are that are not in the base pose (rad), and from where they come."""
         joints = device.joint_names
-        angles = np.array([[{**self.base, **pose}[joint] for joint in joints] for pose, _ in poses.values()])
-        sides = np.array([[float(side.get(joint, 0)) for joint in joints] for _, side in poses.values()])
+        angles = np.array([[{**self.base, **pose}[joint] for joint in joints] for pose in poses.values()])
+        approaches = np.array([[float(sides.get(name, {}).get(joint, 0)) for joint in joints] for name in poses])
         ends = np.array([self.ranges[joint] for joint in joints])
         standing = device.standing(self.base)
         park = np.array([standing[joint] for joint in joints])
-        return of_poses(self.bench, self.acquisition, device, Dataset(tuple(poses), {}), angles, sides, ends, park)
+        return of_poses(self.bench, self.acquisition, device, tuple(poses), angles, approaches, ends, park)
 
     def _pose(self, other: Mapping[str, float]) -> Array:
         return np.array([{**self.base, **other}.get(joint, 0.0) for joint in self.bench.arm.commanded])
 
 
-def _check_names(
-    experiment: Experiment, settings: ServoCalibrationSettings, file: ServoFile, moved: tuple[str, ...]
-) -> None:
-    for key in ("joints", "base", "ranges"):
-        if fault := unknown_joint(getattr(settings, key), moved):
-            where = experiment.source.where((*AT, key))
-            raise ConfigError(f"{fault}.", where=where, hint="Name joints that have a servo in the servo file.")
-    if not moved:
-        text = "the servo file has no servo of a joint of this arm."
-        hint = f"Name them as the joints: {', '.join(file.servos)} are not in the model."
-        raise ConfigError(text, where=experiment.source.where((SECTION, "device")), hint=hint)
-
-
-class ServoDevice(JointDevice, PulseDevice, Protocol):
-    """What a servo calibration needs: joints moved by pulses."""
-
-
 class PulsedJoints(JointDevice):
-    """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end.
+    """Servos by the tables that a calibration was begun with, as far as pulses are allowed: a table's end is no end."""
 
-    Args:
-        setup: which pulses may be set, and the tables by which the device has its angles.
-        device: whose pulses are set.
-        tables: with their boards' clocks, by joint.
-    """
-
-    def __init__(self, setup: Setup, device: ServoDevice, tables: Mapping[str, tuple[PulseTable, PulseClock]]) -> None:
-        self._setup, self._device, self._tables = setup, device, tables
+    def __init__(self, setup: Setup, servos: Mapping[str, KnownServo] = MappingProxyType({})) -> None:
+        self._setup, self._own = setup, {joint: setup.known(joint) for joint in setup.base}
+        self._servos = servos or self._own
+        self._device: Any = setup.bench.device()  # a JointDevice and, as ``open`` checks, a PulseDevice
         self._set: dict[str, int] = {}
 
     @property
     @override
     def joint_names(self) -> tuple[str, ...]:
-        return self._device.joint_names
+        return tuple(self._device.joint_names)
 
     @override
     def open(self, clock: Clock) -> DeviceIdentity:
@@ -348,7 +261,7 @@ class PulsedJoints(JointDevice):
     @override
     def state(self) -> DeviceState:
         state = state_of(self._device)
-        self._set = {joint: _counts(*self._setup.table_of(joint), angle) for joint, angle in state.angles.items()}
+        self._set = {joint: _counts(self._own[joint], angle) for joint, angle in state.angles.items()}
         return DeviceState({joint: self.angle(joint, n) for joint, n in self._set.items()}, state.took_over)
 
     @override
@@ -371,8 +284,15 @@ class PulsedJoints(JointDevice):
 
     @override
     def guard(self, waypoints: Sequence[Mapping[str, float]], rate: float, after_s: float) -> bool:
-        """The device goes no farther than its own tables."""
-        return self._device.guard([self._own(waypoint) for waypoint in waypoints], rate, after_s)
+        """The device has the angles of its own tables, and goes no farther than these."""
+
+        def own(joint: str, angle: float) -> float:
+            table = self._own[joint].table
+            same = float(table.angle(self.pulse(joint, self.counts(joint, angle))))
+            return min(max(same, table.angles[0]), table.angles[-1])
+
+        stated = [{joint: own(joint, angle) for joint, angle in waypoint.items()} for waypoint in waypoints]
+        return bool(self._device.guard(stated, rate, after_s))
 
     @override
     def release(self, joint: str) -> None:
@@ -384,40 +304,24 @@ class PulsedJoints(JointDevice):
         self._device.close()
 
     def angle(self, joint: str, counts: int) -> float:
-        """Where a pulse puts a joint by its table (rad)."""
-        return float(self._tables[joint][0].angle(self.pulse(joint, counts)))
+        return float(self._servos[joint].table.angle(self.pulse(joint, counts)))
 
     def pulse(self, joint: str, counts: int) -> float:
-        return counts * self._tables[joint][1].tick
+        return counts * self._servos[joint].clock.tick
 
     def counts(self, joint: str, angle: float) -> int:
-        """The counts that the table gives for an angle (rad)."""
-        return _counts(*self._tables[joint], angle)
+        return _counts(self._servos[joint], angle)
 
     def turn_counts(self, joint: str, turn: float) -> int:
         """The counts of a turn (rad) where the table has least."""
-        table, clock = self._tables[joint]
-        return max(int(turn * table.least_slope / clock.tick) - 1, 1)
+        servo = self._servos[joint]
+        return max(int(turn * servo.table.least_slope / servo.clock.tick) - 1, 1)
 
     def rises(self, joint: str) -> bool:
-        pulses = self._tables[joint][0].pulses
+        pulses = self._servos[joint].table.pulses
         return pulses[0] < pulses[-1]
 
-    def _own(self, angles: Mapping[str, float]) -> dict[str, float]:
-        """Angles as the device has them, within its tables."""
-        own = {}
-        for joint, angle in angles.items():
-            table = self._setup.table_of(joint)[0]
-            same = float(table.angle(self.pulse(joint, self.counts(joint, angle))))
-            own[joint] = min(max(same, table.angles[0]), table.angles[-1])
-        return own
-
     def _allowed(self, joint: str, angle: float) -> int:
-        """The counts for an angle (rad).
-
-        Raises:
-            DeviceRefusedError: the pulse is outside the range that is allowed.
-        """
         counts, (low, high) = self.counts(joint, angle), self._setup.pulses_of(joint)
         if not low <= self.pulse(joint, counts) <= high:
             raise DeviceRefusedError(
@@ -432,5 +336,164 @@ class PulsedJoints(JointDevice):
         self._set[joint] = counts
 
 
-def _counts(table: PulseTable, clock: PulseClock, angle: float) -> int:
-    return int(clock.counts(table.pulse(angle)))
+def _counts(servo: KnownServo, angle: float) -> int:
+    return int(servo.clock.counts(servo.table.pulse(angle)))
+
+
+BEGUN, POSE, ANGLE, LEFT_OUT = "begun", "pose", "angle", "left_out"  # Kinds of entries
+
+_SAME = 1e-6
+
+
+class Record:
+    """The observations in a folder's journal; what is there is read at once, and written to when needed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.path = folder, folder / JOURNAL
+        self._journal: Journal | None = None
+        self._entries: list[Mapping[str, Any]] = []
+        if has_journal(folder):
+            with KeptJournal(folder) as journal:
+                self._entries = [{"kind": entry.kind, **entry.content} for entry in journal.entries()]
+        if self._entries and self._entries[0]["kind"] != BEGUN:
+            text = "its first entry does not say by which tables it was begun."
+            raise DataError(text, where=Location(str(self.path)), hint="Give another --out.")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *ending: object) -> None:
+        self._close()
+
+    @property
+    def entries(self) -> tuple[Mapping[str, Any], ...]:
+        return tuple(self._entries)
+
+    @property
+    def begun(self) -> Mapping[str, Any] | None:
+        return self._entries[0] if self._entries else None
+
+    def set_aside(self) -> Path:
+        self._opened()
+        self._close()
+        kept = next_name(self.path)
+        with writing(self.path, "Give --out a writable folder."):
+            self.path.rename(kept)
+        self._entries = []
+        return kept
+
+    def append(self, kind: str, values: Mapping[str, Any]) -> None:
+        self._opened().record(kind, dict(values))
+        self._entries.append({"kind": kind, **values})
+
+    def _opened(self) -> Journal:
+        if self._journal is None:
+            self._journal = Journal(self.folder, {})
+        return self._journal
+
+    def _close(self) -> None:
+        if self._journal is not None:
+            self._journal.close()
+        self._journal = None
+
+
+class SweepLog(Log):
+    """Of a run whose poses are those of sweeps: what was observed goes to the record, and no more.
+
+    A pose is called by its joint, counts and side: ``q3 307 +``. What an earlier run left out is tried once more.
+    """
+
+    def __init__(self, record: Record) -> None:
+        self._record, entries = record, record.entries
+        measured = {pose_name(e["joint"], e["counts"], e["came"]): e for e in entries if e["kind"] == POSE}
+        warm = next((entry for entry in reversed(entries) if entry.get("warmth")), None)
+        self.progress = Progress(measured)
+        if warm is not None:
+            self.progress = Progress(measured, thermal_state=warm["warmth"], at=float(warm["at"]))
+
+    @override
+    def record(self, kind: str, content: Mapping[str, Any]) -> None:
+        self.progress = self.progress.after(kind, content)
+        if kind not in (MEASURED, PASSED):
+            return
+        joint, counts, side = str(content["pose"]).rsplit(" ", 2)
+        line: dict[str, Any] = {"joint": joint, "counts": int(counts), "came": 1 if side == "+" else -1}
+        if kind == PASSED:
+            self._record.append(LEFT_OUT, {**line, "at": self.progress.at, "why": content["why"]})
+            return
+        deviations = [float(d) if np.isfinite(d) else None for d in content["deviation"]] + content["turn_deviation"]
+        line |= {"at": content["at"], "warmth": content["warmth"], "told": content["standing"]}
+        line |= {key: content[key] for key in ("position", "rotation", "frames")}
+        self._record.append(POSE, {**line, "deviations": deviations})
+
+
+def pose_name(joint: str, counts: int, came: int) -> str:
+    return f"{joint} {counts} {'+' if came > 0 else '-'}"
+
+
+def next_name(path: Path) -> Path:
+    """The first of ``NAME.before-1``, ``NAME.before-2``, ... that is free, for a file that is to be kept."""
+    number = 1
+    while (kept := path.with_name(f"{path.name}.before-{number}")).exists():
+        number += 1
+    return kept
+
+
+def begin(setup: Setup, record: Record, device: DeviceIdentity) -> None:
+    """The first entry of a record; it is written when nothing is left that could refuse the run."""
+    if record.begun is None:
+        servos = {joint: _as_stated(setup, joint) for joint in setup.base}
+        content = {"servos": servos, "device": device.name, "adapter": device.adapter, "base": dict(setup.base)}
+        record.append(BEGUN, content)
+
+
+def check_same(setup: Setup, record: Record, device: DeviceIdentity) -> None:
+    begun = record.begun
+    if begun is None:
+        return
+    where = Location(str(record.path))
+    adapter = str(begun.get("adapter", ""))
+    if adapter and device.adapter and adapter != device.adapter:
+        text = f"it was begun with the adapter {adapter!r}, found {device.adapter!r}."
+        raise InputError(text, where=where, hint="Connect the one that it was begun with, or give a new --out.")
+    moved = [joint for joint, angle in setup.base.items() if abs(begun["base"].get(joint, angle) - angle) > _SAME]
+    if moved:
+        raise InputError(
+            f"it was begun with another base pose: {moved[0]} stood at {_deg(begun['base'][moved[0]])}, not at "
+            f"{_deg(setup.base[moved[0]])}.",
+            where=where,
+            hint="Give the base pose that it was begun with, or a new --out.",
+        )
+    for joint in setup.base:
+        stated, before = _as_stated(setup, joint), begun["servos"].get(joint, {})
+        if any(stated[key] != before.get(key) for key in ("board", "channel", "oscillator_hz", "prescale")):
+            text = f"it was begun with another board, channel or oscillator of {joint}."
+            raise InputError(text, where=where, hint="Give a new --out.")
+
+
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.1f} deg"
+
+
+def _as_stated(setup: Setup, joint: str) -> dict[str, Any]:
+    servo = setup.file.servos[joint]
+    clock = setup.file.boards[servo.board].clock
+    return {
+        "board": str(servo.board),
+        "channel": servo.channel,
+        "oscillator_hz": clock.oscillator_hz,
+        "prescale": clock.prescale,
+        "angles": list(servo.angles),
+        "pulses": list(servo.pulses),
+    }
+
+
+def stated_by(setup: Setup, begun: Mapping[str, Any]) -> dict[str, KnownServo]:
+    """All servos, as they were when a record was begun."""
+    servos = {joint: setup.known(joint) for joint in setup.base}
+    for joint, stated in begun["servos"].items():
+        if joint in servos:
+            table = PulseTable(tuple(stated["angles"]), tuple(stated["pulses"]))
+            clock = PulseClock(stated["oscillator_hz"], stated["prescale"])
+            servos[joint] = replace(servos[joint], table=table, clock=clock)
+    return servos

@@ -1,1 +1,0 @@
-"""Measuring runs: a pose plan driven, measured and journalled."""

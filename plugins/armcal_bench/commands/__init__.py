@@ -1,1 +1,0 @@
-"""Commands of ``armcal`` that this application adds."""

@@ -1,1 +1,0 @@
-"""Postures recorded while a person guides the arms by hand."""

@@ -1,1 +1,0 @@
-"""Servo calibration: which pulse makes which angle."""
