@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from armcal.diagnose.coverage import Scores, missed, scored
+from armcal.diagnose.record_checks import Scores, missed, scored
 from armcal.estimate.prediction import Predictor
 from armcal.estimate.robust import fit
 from armcal.problem.problem import Problem

@@ -42,3 +42,8 @@ def fit_that_left(outcome, widened=()) -> Fit:
     """A converged fit of which nothing but the structure of its residuals is known, and whether intervals grew."""
     estimate = SimpleNamespace(widened=widened, verdict=SimpleNamespace(converged=True))
     return fit_that_found(estimate, {structure: outcome}, unit="mm")
+
+
+def whole(finding) -> str:
+    """Its text, test and action."""
+    return f"{finding.text} [{finding.test}] {finding.action}"

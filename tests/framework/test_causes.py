@@ -16,7 +16,7 @@ from armcal.diagnose.residual_structure import LEVEL, UNLISTED, depends, neighbo
 from armcal.estimate.robust import fit
 from armcal_ipopt.estimator import IpoptEstimator
 from click.testing import CliRunner
-from fits import fit_of, fit_that_left
+from fits import fit_of, fit_that_left, whole
 from noise_cases import NOISE_M, posed
 
 DEG = np.pi / 180
@@ -109,7 +109,7 @@ def graded(found, name):
 
 
 def said(found):
-    return " ".join(finding.whole for finding in depends(fit_that_left(found)))
+    return " ".join(whole(finding) for finding in depends(fit_that_left(found)))
 
 
 @pytest.mark.parametrize("name", NAMED)

@@ -20,6 +20,7 @@ from armcal.planning.suggestion import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner
+from fits import whole
 from planted_mistakes import outcome, three_joint_arm, tips, with_tips
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "lrm_arm"
@@ -173,7 +174,7 @@ def test_an_instrument_of_micrometres_has_no_errors_of_nothing(tmp_path: Path, d
     drifting = 1e-6 * drift_um * np.linspace(0, 1, len(data)) * np.array([[1.0], [0.0], [0.0]])
     path = arm.write(with_tips(data, tips(data) + drifting), tmp_path / "data.csv")
     verdict = calibrate(Experiment.load(arm.config, arm.overrides, path)).verdict
-    texts = " ".join([verdict.headline, verdict.paragraph, *(finding.whole for finding in verdict.findings)])
+    texts = " ".join([verdict.headline, verdict.paragraph, *(whole(finding) for finding in verdict.findings)])
     assert ("would fall by 0.00" in texts) == bool(drift_um)
     assert not re.findall(r"\b0\.0+ (mm|%|times)|0\.0+ to 0\.0+ times", texts)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from armcal.diagnose.coverage import Scores, coverage, missed, predictor, stretch
+from armcal.diagnose.record_checks import Scores, coverage, missed, predictor, stretch
 from armcal.estimate.robust import fit
 from armcal.estimate.simulation import with_channels
 from armcal.run.experiment import Experiment

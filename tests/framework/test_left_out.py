@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from armcal.diagnose.coverage import predictor
+from armcal.diagnose.record_checks import predictor
 from armcal.estimate.robust import fit
 from armcal.run.experiment import Experiment
 from drifting import DEMO, FREE, dense_drift, dense_slopes, drifting_problem, problem_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from armcal.base.dataset import Dataset
 from armcal.diagnose.gross import worse_than_nominal
-from armcal.diagnose.outliers import FEWEST, moved
+from armcal.diagnose.record_checks import FEWEST_IN_GROUP, moved
 from armcal.estimate.polish import mislabelled, settled, started, untrained
 from armcal_contact.contacts import BallInSocket, BallInSocketSettings
 from fits import fit_that_found
@@ -79,7 +79,7 @@ def test_a_move_no_larger_than_the_scatter_is_not_claimed():
 
 
 def test_few_records_say_nothing():
-    assert found(0.01, 3, count=FEWEST - 1) == []
+    assert found(0.01, 3, count=FEWEST_IN_GROUP - 1) == []
 
 
 def test_a_calibration_that_is_worse_than_none_is_told_by_the_records_that_judge():

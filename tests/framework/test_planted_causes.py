@@ -15,7 +15,7 @@ from armcal.diagnose.residual_structure import (
     neighbours,
     repeated,
 )
-from fits import fit_that_left
+from fits import fit_that_left, whole
 from planted_causes import CAUSES, COUNT, DEG, LIMITS, Cause, experiment, graded, joint, left, recording, when
 
 SEEDS = 8
@@ -55,7 +55,7 @@ def along_a_path(seed: int) -> np.ndarray:
 def said(found: ResidualStructure) -> str:
     fit = fit_that_left(found)
     findings = [*depends(fit), *neighbours(fit)]
-    return " ".join(finding.whole for finding in findings)
+    return " ".join(whole(finding) for finding in findings)
 
 
 @pytest.mark.slow

@@ -13,7 +13,8 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration_file import sealed
 from armcal.cli.main import cli
-from armcal.diagnose.coverage import (
+from armcal.diagnose.fit import widened
+from armcal.diagnose.record_checks import (
     FEWEST,
     Coverage,
     Scores,
@@ -24,7 +25,6 @@ from armcal.diagnose.coverage import (
     stretch,
     whitened_like,
 )
-from armcal.diagnose.fit import widened
 from armcal.estimate.prediction import LEVELS, Spread
 from armcal.estimate.robust import fit
 from armcal.estimate.simulation import SimulationRequest, measured_without_noise, with_channels

@@ -21,10 +21,9 @@ from armcal.base.domains import Interval, Pose, Semidefinite
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.config.system import StaticsSettings, System
 from armcal.diagnose.causes import contradictions
-from armcal.diagnose.coverage import intervals
 from armcal.diagnose.fit import Fit, Prepared, RecordErrors
 from armcal.diagnose.gross import hidden_payload, rounding
-from armcal.diagnose.outliers import large_errors, noise_of, outlying
+from armcal.diagnose.record_checks import intervals, large_errors, noise_of, outlying
 from armcal.diagnose.residual_structure import depends, structure
 from armcal.diagnose.verdict import (
     Verdict,

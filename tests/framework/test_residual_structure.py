@@ -15,7 +15,7 @@ from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset
 from armcal.diagnose.causes import Functions
 from armcal.diagnose.fit import FitRows, own_basis
-from armcal.diagnose.outliers import large_errors
+from armcal.diagnose.record_checks import large_errors
 from armcal.diagnose.residual_structure import DRAWS, LEVEL, MOST_RECORDS, Contest, structure
 from armcal.diagnose.verdict import determined, priors_alone, tip_by_priors, unseen_poses
 from armcal.estimate.robust import fit

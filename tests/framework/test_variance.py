@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from armcal.diagnose.outliers import component_findings
+from armcal.diagnose.record_checks import component_findings
 from armcal.errors import ProblemError
 from armcal.estimate.robust import NoiseSettings, fit, weighed
 from armcal.estimate.variance import Term, _evaluate, apply_components, estimate_components, maximise

@@ -21,7 +21,7 @@ from armcal.base.settings import Settings
 from armcal.base.units import display_unit, split_suffix, to_unit
 from armcal.calibration.tool_expression import APPROACH
 from armcal.config.system import System
-from armcal.diagnose.coverage import Stretch, level_name
+from armcal.diagnose.record_checks import Stretch, level_name
 from armcal.errors import DataError
 from armcal.estimate.prediction import POSITION, STATED, TURN, Predictor, Spread, is_position
 from armcal.estimate.variance import Axes, Component, VarianceComponents, apply_components

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -170,25 +171,13 @@ def freed(problem: Problem, names: Sequence[str]) -> Problem:
     return replace(problem, compiled=compiled)
 
 
-def moves_of(problem: Problem, values: Array, held: Sequence[str]) -> Moves:
-    wider = freed(problem, held)
-    bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in problem.records]
-    chain, parts = wider.parameters.entries_jacobian(values), []
-    for kernel, block in zip(wider.kernels, wider.with_records(bare).jacobians(values), strict=True):
-        noise = np.array(kernel.factor.noise)[:, None, None]
-        parts.append(noise * np.einsum("rvn,vc->rnc", block, chain))
-    return {name: tuple(part[:, :, own] for part in parts) for name, own in wider.parameters.coordinates_of.items()}
-
-
 def instruments(fit: Fit) -> list[Finding]:
     findings = []
     for one in fit.of(contradictions):
         text = f"{one.words[:1].upper()}{one.words[1:]}: {'; '.join(map(str, one.parameters))} (1 sd)."
         freedom = min(parameter.freedom for parameter in one.parameters)
-        test = (
-            f"beside the free parameters and others that instruments hold, records as clusters; t, at least "
-            f"{freedom:.0f} degrees of freedom, {100 * MISTAKEN:g} % each"
-        )
+        test = "beside the free parameters and others that instruments hold, records as clusters; t, at least "
+        test += f"{freedom:.0f} degrees of freedom, {100 * MISTAKEN:g} % each"
         free = f"or free {', '.join(parameter.name for parameter in one.parameters)} (parameters.free) with a prior"
         findings.append(Finding("warning", text, test, f"{one.check}; {free}."))
     return findings
@@ -211,8 +200,6 @@ _FEWEST_APART = 4
 
 @dataclass(frozen=True)
 class Cause:
-    """One thing that residuals might depend on."""
-
     kind: str  # in the arm ``held`` to ``temperature``; outside of it ``step``, ``slip``, ``gravity``, ``load``, ...
     subject: str  # the joint or site, as a user names it; empty where it is none
     words: str  # what residuals depend on, as the end of a sentence
@@ -234,6 +221,21 @@ class Records:
     motion: Motion
     positions: tuple[Array, ...] = ()  # what each factor should read of a position (3 x N; m), or nothing (0 x N)
     moves: Moves = field(default_factory=dict)  # by parameters that are held
+
+    @classmethod
+    def of(cls, fit: Fit, chosen: Indices) -> Self:
+        """Some of the training records, in this order, with the weights that they had."""
+        problem, values = with_contradicted(fit, fit.few_acting).subset(chosen), fit.estimate.values
+        dataset, rows, parts = fit.ready.trained.subset(chosen), FitRows.of(problem, fit.estimate), []
+        bare = [replace(one, weight=np.sign(one.weight), whitening=None, correlation=None) for one in problem.records]
+        wider = freed(problem, candidates(problem.parameters))
+        chain, places = wider.parameters.entries_jacobian(values), wider.parameters.coordinates_of
+        for kernel, block in zip(wider.kernels, wider.with_records(bare).jacobians(values), strict=True):
+            noise = np.array(kernel.factor.noise)[:, None, None]
+            parts.append(noise * np.einsum("rvn,vc->rnc", block, chain))
+        moves = {name: tuple(part[:, :, own] for part in parts) for name, own in places.items()}
+        motion, read = fit.motion.subset(fit.split.train[chosen]), predicted_positions(problem, values, dataset)
+        return cls(problem, rows, dataset, motion, read, moves)
 
     @property
     def arms(self) -> Mapping[str, Arm]:
@@ -551,9 +553,8 @@ def _of_mistakes(here: Records) -> Iterator[Cause]:
 def _of_loads(here: Records) -> Iterator[Cause]:
     if here.motion.by_load:  # slopes by turns of gravity, its size, mass and place of a payload
         by_load = [slope.transpose(0, 2, 1) for slope in here.motion.by_load]  # n_r x N x (gravity's turn, size, load)
-        gravity, size, load = (
-            tuple(slope[:, :, part] for slope in by_load) for part in (slice(0, 3), slice(3, 4), slice(4, 8))
-        )
+        parts = slice(0, 3), slice(3, 4), slice(4, 8)
+        gravity, size, load = (tuple(slope[:, :, part] for slope in by_load) for part in parts)
         level = "level the base, or measure its tilt with a spirit level; gravity is stated in the instrument's frame"
         weigh, turns = "weigh what hangs on the tool", tuple(f"turned about {axis}" for axis in _AXES)
         words, effect = "the direction of gravity in the base frame", "statics.gravity_r?, freed"
@@ -657,8 +658,6 @@ _RIDGE = 0.05
 
 @dataclass(frozen=True)
 class Input:
-    """What was recorded: a joint, the side it was approached from, time, payload or temperature."""
-
     kind: str  # ``joint``, ``approach``, ``time``, ``payload`` or ``temperature``
     words: str
     channel: str  # of the joint; empty where it is none

@@ -28,11 +28,6 @@ class Finding:
     test: str = ""
     action: str = ""
 
-    @property
-    def whole(self) -> str:
-        """All of it in one text."""
-        return self.text + (f" [{self.test}]" if self.test else "") + (f" {self.action}" if self.action else "")
-
 
 class CheckFunction(Protocol):
     """A function of a fit (``armcal.diagnose.fit.Fit``) that gives findings: none where it has nothing to say.
@@ -107,7 +102,7 @@ FIT_CHECKS = (
           "data.md"),
     Check("gross", "Is the error gross beside the arm's reach?", "0 of 1,200", "gross:gross"),
     Check("jump", "Do the records contradict one another from one place on?", "0 of 1,200", "gross:jumped"),
-    Check("minority", "Do many records contradict the others?", "0 of 1,200", "outliers:contradicting"),
+    Check("minority", "Do many records contradict the others?", "0 of 1,200", "record_checks:contradicting"),
     Check("size", "Is the calibrated arm as large as the nominal one?", "0.4 %", "gross:size"),
     Check("displaced", "Is a parameter far from its prior or its nominal value?", "0 of 1,200", "gross:displaced"),
     Check("scale", "Which error of an instrument's scale would not show?", "5 %", "gross:scale", "trackers.md"),
@@ -119,12 +114,12 @@ FIT_CHECKS = (
     Check("aligned", "Are positions far worse than those aligned before the fit?", "0 of 1,200", "gross:aligned"),
     Check("overfitted", "Are unseen records missed by far more than those that trained?", "2 of 1,200",
           "gross:overfit"),
-    Check("intervals", "Do prediction intervals cover their share?", "0.5 %", "coverage:covered"),
+    Check("intervals", "Do prediction intervals cover their share?", "0.5 %", "record_checks:covered"),
     Check("places", "How well are base and target known?", EXACT, "verdict:places"),
-    Check("moved", "Did what the arm touches move?", "0 of 1,200", "outliers:moved", "ball_and_sockets.md"),
+    Check("moved", "Did what the arm touches move?", "0 of 1,200", "record_checks:moved", "ball_and_sockets.md"),
     Check("still", "Did a joint stand still?", EXACT, "data:still", "data.md"),
     Check("same_poses", "Are held-out records at poses that trained?", EXACT, "data:same_poses"),
-    Check("outliers", "Are records missed by more than noise explains?", "1 %", "outliers:outlying", "noise.md"),
+    Check("outliers", "Are records missed by more than noise explains?", "1 %", "record_checks:outlying", "noise.md"),
     Check("next", "What is least certain, and which poses would add most?", EXACT, "verdict:next_poses", "plan.md"),
 )  # fmt: skip
 """Of a fit, in the order of the verdict within one grade."""

@@ -21,26 +21,16 @@ from armcal.arm.assembly import Arm, command_channels, shown_joint
 from armcal.base.arrays import Array, Mask
 from armcal.base.dataset import Dataset
 from armcal.base.units import digits, to_unit
-from armcal.config.system import System
 from armcal.diagnose.checks import Finding, Grade, first_few
 from armcal.diagnose.fit import Fit, Prepared, thinned
 from armcal.errors import DataError, Location, NotConvergedError
 from armcal.estimate.polish import descended
 from armcal.estimate.start import Placing, placings
 from armcal.measure.groups import first_of_pose
+from armcal.problem import rigid_alignment as rigid
 from armcal.problem.problem import FactorRecords, PosedProblem, Problem
 from armcal.problem.records import subset
-from armcal.problem.rigid_alignment import (
-    Sighting,
-    Tools,
-    nearest,
-    rigid_fit,
-    shown_instead,
-    sighting_of,
-    spread_of,
-    tools,
-    tools_of,
-)
+from armcal.problem.rigid_alignment import spread_of
 
 Wires = Mapping[str, tuple[Mapping[str, float], float]]
 """Channels, each read as a sum of channels times factors, and a summand."""
@@ -59,8 +49,7 @@ _FAR, _HALVINGS = 3.0, 60
 FEWEST_IN_PART = 8  # Records in a part: an alignment has nine numbers
 _PARTS, _ROUNDS = (0.25, 0.5, 0.75), 3
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "inches": _INCH / 1000}
-LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)
-"""What lengths are off by that were read in mm, cm, m or inches and taken for another of these."""
+LENGTHS = (10.0, 0.1, 1000.0, 0.001, _INCH, 1 / _INCH, 1000 / _INCH, _INCH / 1000)  # Of one of these read as another
 _AXIS_LENGTHS = (10.0, 0.1, 1000.0, 0.001)
 LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two exchanged)"
 
@@ -68,9 +57,7 @@ LEFT_HANDED = "a left-handed frame made right-handed (one axis reversed, or two 
 def single_joints(arm: Arm) -> list[tuple[str, Wires]]:
     joints = tuple(arm.commanded)
     angles = {joint: joint for joint, dimension in arm.commanded.items() if dimension == "angle"}
-    readings: list[tuple[str, Wires]] = [
-        (f"the sign of {joint} reversed", _wires(arm, {joint: joint}, -1.0)) for joint in joints
-    ]
+    readings = [(f"the sign of {joint} reversed", _wires(arm, {joint: joint}, -1.0)) for joint in joints]
     for one, other in combinations(joints, 2):
         if arm.commanded[one] == arm.commanded[other]:
             readings.append((f"{one} and {other} exchanged", _wires(arm, {one: other, other: one}, 1.0)))
@@ -104,10 +91,8 @@ def several_joints(arm: Arm) -> Iterator[tuple[str, Wires]]:
     if len(set(arm.commanded.values())) == 1:
         orders = [joints[::-1], *(joints[step:] + joints[:step] for step in range(1, len(joints)))]
         for order in orders if len(joints) > 2 else ():
-            yield (
-                f"({', '.join(order)}) taken for ({', '.join(joints)})",
-                _wires(arm, dict(zip(joints, order, strict=True)), 1.0),
-            )
+            words = f"({', '.join(order)}) taken for ({', '.join(joints)})"
+            yield words, _wires(arm, dict(zip(joints, order, strict=True)), 1.0)
 
 
 def _wires(arm: Arm, joints: Mapping[str, str], factor: float, added: float = 0.0) -> Wires:
@@ -255,12 +240,10 @@ def within(along: Array, sizes: Array, radius: float) -> Array:
 
 
 MUCH_BETTER = 3.0  # A permutation leaves so many times less than the data as they stand
-FITS, MISSES = 0.15, 0.01
-"""Of the spread of the positions: what a right reading leaves at most to first order, what is worth a look."""
+FITS, MISSES = 0.15, 0.01  # Of the spread of positions: what a right reading leaves to first order, is worth a look
 _NOISE, _EXPLAINS = 3.0, (0.05, MUCH_BETTER)
 """What it leaves at most once fitted: times the noise; of the spread, and so many times less than the data as given."""
-_HOPELESS, _EXPLAINS_HOPELESS = 0.1, (0.08, 1.8)
-"""The same where no parameters mend what is given, of the spread: a model that lacks much may leave half of that."""
+_HOPELESS, _EXPLAINS_HOPELESS = 0.1, (0.08, 1.8)  # The same where what is given leaves more than this of the spread
 _FITTED, _FIT_STEPS, _FIT_DAMPING, _FARTHEST, _DETERMINED = 5, 25, 1e-3, 8.0, 1e-3
 _MOST_RECORDS = 300
 _EQUATIONS = 2.0  # So many numbers a parameter are needed to separate readings
@@ -273,8 +256,6 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class PermutedAxes:
-    """A reading of the data that fits much better than the data as they stand."""
-
     measurement: str  # whose positions
     readings: tuple[str, ...]  # those that fit about as well as the best one, in words
     as_given_mm: float  # what the data leave as they stand (root mean square, free parameters adapted)
@@ -299,7 +280,7 @@ class _Seen:
     """A measurement that gives positions in the base frame, and what is left however it is read."""
 
     problem: Problem
-    sighting: Sighting  # what was measured
+    sighting: rigid.Sighting  # what was measured
     records: FactorRecords  # of its kernel alone, their noise as declared
     rows: tuple[tuple[str, Array], ...]  # what was measured a row before and a row after, in words (3 x n each, m)
     ids: tuple[str, ...]  # of the records (n)
@@ -308,7 +289,7 @@ class _Seen:
     @classmethod
     def of(cls, problem: Problem, dataset: Dataset, number: int) -> Self | None:
         """Of at most so many records; those without both neighbours are left out, unless these are most."""
-        sighting, rows = sighting_of(problem, dataset, number, _MOST_RECORDS), tuple[tuple[str, Array], ...]()
+        sighting, rows = rigid.sighting_of(problem, dataset, number, _MOST_RECORDS), tuple[tuple[str, Array], ...]()
         if sighting is None:
             return None
         positions = dataset.stacked(problem.kernels[number].factor.position_channels)
@@ -364,8 +345,8 @@ class _Seen:
         placing, number, nominal = self.placing, self.sighting.kernel, self.problem.blueprint.parameters.nominal()
         if placing is None:
             return nominal, measured, 0.0
-        tools = tools_of(self.problem.with_record(number, self.read(read_as)), nominal, number)
-        alignment = nearest(tools, measured, placing.basis)
+        tools = rigid.tools_of(self.problem.with_record(number, self.read(read_as)), nominal, number)
+        alignment = rigid.nearest(tools, measured, placing.basis)
         values = placing.with_target(self.problem.parameters, nominal, alignment.offset)
         return values, alignment.back(measured), alignment.left
 
@@ -386,8 +367,8 @@ class _Seen:
         own, rows = self.read(read_as), np.zeros(len(self.problem.kernels[number].factor.noise))
         rows[:3] = 1 / self.noise
         some[number] = replace(own, whitening=np.tile(np.diag(rows)[:, :, None], len(own.weight)))
-        shown = Tools(measured, np.tile(np.eye(3), (own.count, 1, 1)))
-        problem = shown_instead(self.problem.with_records(some), number, shown)
+        shown = rigid.Tools(measured, np.tile(np.eye(3), (own.count, 1, 1)))
+        problem = rigid.shown_instead(self.problem.with_records(some), number, shown)
         posed = PosedProblem(problem)
         try:
             if problem.increments:
@@ -412,11 +393,7 @@ class _Seen:
         yield from self.rows
 
     def readings(
-        self,
-        wirings: Sequence[tuple[str, Wires]],
-        axes: Sequence[tuple[str, Array]],
-        straight: Adapting,
-        enough: float,
+        self, wirings: Sequence[tuple[str, Wires]], axes: Sequence[tuple[str, Array]], straight: Adapting, enough: float
     ) -> Iterator[_Reading]:
         """Channels read otherwise, each beside each way of reading positions. What one leaves counts as many times more
         as its positions are spread less than the arm's: measured ones near one point are near those of any arm."""
@@ -439,12 +416,14 @@ class _Seen:
         if self.placing is None or len(every) < 2 * FEWEST_IN_PART:
             return
         nominal, basis = self.problem.blueprint.parameters.nominal(), self.placing.basis
-        tools, divisions = tools_of(self.problem.with_record(number, self.records), nominal, number), []
+        tools, divisions = rigid.tools_of(self.problem.with_record(number, self.records), nominal, number), []
         for part in _PARTS:
             begins = round(part * len(every))
             for _ in range(_ROUNDS):
                 begins = min(max(begins, FEWEST_IN_PART), len(every) - FEWEST_IN_PART)
-                halves = [nearest(tools.subset(own), measured[:, own], basis) for own in np.split(every, [begins])]
+                halves = [
+                    rigid.nearest(tools.subset(own), measured[:, own], basis) for own in np.split(every, [begins])
+                ]
                 squares = [np.sum((measured - alignment.moved(tools)) ** 2, axis=0) for alignment in halves]
                 before, after = (np.concatenate([[0.0], np.cumsum(square)]) for square in squares)
                 left = before + after[-1] - after
@@ -488,7 +467,7 @@ class _Seen:
         readings += [*seen.readings(joints, [("", self.measured)], straight, enough), *seen.in_two_frames()]
         explained = seen.explained(readings, enough)
         if not explained and seen.placing is None:
-            turn, shift = rigid_fit(straight.predicted, self.measured)
+            turn, shift = rigid.rigid_fit(straight.predicted, self.measured)
             angle = float(np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn).as_rotvec())))
             apart = f"{digits(float(np.linalg.norm(shift)) * _MM)} mm and {digits(angle, 2)} deg"
             moved = turn.T @ (self.measured - shift[:, None])
@@ -547,7 +526,7 @@ def _of_contact(problem: Problem, number: int, arms: Sequence[Arm]) -> PermutedA
         away = [np.linalg.norm(part - np.median(part, axis=1, keepdims=True), axis=0) for part in parts]
         return float(np.median(np.concatenate(away))) if away else np.inf
 
-    reach = spread_of(tools(problem, nominal)[0][0])
+    reach = spread_of(rigid.tools(problem, nominal)[0][0])
     if not MISSES * reach < (as_given := left({})) < np.inf:
         return None
     # Another unit of angles would put all tools near one place, whatever they touch.
@@ -576,10 +555,8 @@ def mixed_up(ready: Prepared) -> list[Finding]:
     if reading is None:
         return []
     adapted = "model, however its free parameters adapt" if reading.adapted else "nominal arm"
-    text = (
-        f"{reading.measurement}: as they stand, the data are typically {digits(reading.as_given_mm)} mm off the "
-        f"{adapted}; with {', or with '.join(reading.readings)}, they are {digits(reading.left_mm)} mm off."
-    )
+    text = f"{reading.measurement}: as they stand, the data are typically {digits(reading.as_given_mm)} mm off the "
+    text += f"{adapted}; with {', or with '.join(reading.readings)}, they are {digits(reading.left_mm)} mm off."
     of_model = "the order, the directions or the zeros of the joints in the model"
     of_model = of_model if reading.of_joints else "how the tracker's frame lies"
     hint = f"Check the unit in the column names; mend columns in the file or by data.columns, or {of_model}."
@@ -598,19 +575,17 @@ def masses(ready: Prepared) -> list[Finding]:
         limit = _DENSEST * size**3
         if total > limit:
             worst = max(arm.masses, key=lambda mass: mass.mass)
-            text = (
-                f"The links of {name} weigh {digits(total)} kg ({worst.name}: {digits(worst.mass)} kg), and the arm is "
-                f"{digits(arm.length)} m long from joint to joint: no arm of that length weighs more than "
-                f"{digits(limit)} kg. Are these grams?"
-            )
+            text = f"The links of {name} weigh {digits(total)} kg ({worst.name}: {digits(worst.mass)} kg), and the arm "
+            text += f"is {digits(arm.length)} m long from joint to joint: no arm of that length weighs more than "
+            text += f"{digits(limit)} kg. Are these grams?"
             test = f"limit {_DENSEST:g} kg for each cubic metre of the length, {_SHORTEST:g} m at least"
             findings.append(Finding("warning", text, test, f"Correct the masses: arms.{name}.links, or the URDF's."))
     return findings
 
 
-def still_joints(system: System, dataset: Dataset) -> dict[str, str]:
-    still = {}
-    for channel, dimension in command_channels(system.arms).items():
+def still_joints(fit: Fit) -> dict[str, str]:
+    dataset, still = fit.ready.trained, {}
+    for channel, dimension in command_channels(fit.system.arms).items():
         unit, least = _STILL[dimension]
         values = dataset.column(channel) if dataset.has(channel) else np.array([])
         known = to_unit(values[np.isfinite(values)], unit)
@@ -620,18 +595,15 @@ def still_joints(system: System, dataset: Dataset) -> dict[str, str]:
 
 
 def still(fit: Fit) -> list[Finding]:
-    stood = still_joints(fit.system, fit.ready.trained)
+    stood = fit.of(still_joints)
     if not stood:
         return []
     listed = [f"{shown_joint(c, fit.system.arms)} at {where}" for c, where in stood.items()]
-    text = (
-        f"Hardly moved in the training records: {first_few(listed)}. Predictions elsewhere rest on nominal values and "
-        "priors, and no record judges them."
-    )
+    text = f"Hardly moved in the training records: {first_few(listed)}. Predictions elsewhere rest on nominal values "
+    text += "and priors, and no record judges them."
     test = "range, limits " + " and ".join(f"{least:g} {unit}" for unit, least in _STILL.values())
-    return [
-        Finding("warning", text, test, "Move these joints too, or use the calibration only where they stand there.")
-    ]
+    action = "Move these joints too, or use the calibration only where they stand there."
+    return [Finding("warning", text, test, action)]
 
 
 def same_poses(fit: Fit) -> list[Finding]:
@@ -640,10 +612,8 @@ def same_poses(fit: Fit) -> list[Finding]:
     count, held = int(np.isin(pose[split.holdout], pose[split.train]).sum()), len(split.holdout)
     if not count:
         return []
-    text = (
-        f"{count} of {held} held-out records are at poses that trained: their errors show how well a pose repeats, not "
-        "how good the model is elsewhere."
-    )
+    text = f"{count} of {held} held-out records are at poses that trained: their errors show how well a pose repeats, "
+    text += "not how good the model is elsewhere."
     return [Finding("warning", text, "poses alike in all joints, under the same load", "Hold out other poses.")]
 
 

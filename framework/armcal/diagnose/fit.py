@@ -30,7 +30,7 @@ from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimate, Estimator, gave_up
 from armcal.estimate.polish import descended, restricted, settled, untrained, with_free
 from armcal.estimate.prediction import POSITION, is_position
-from armcal.estimate.robust import WeighedFit, Weighing
+from armcal.estimate.robust import WeighedFit
 from armcal.estimate.start import BETTER, Start
 from armcal.estimate.validation import (
     CrossValidation,
@@ -123,11 +123,6 @@ class Fit:
     @property
     def converged(self) -> bool:
         return self.estimate.verdict.converged
-
-    @property
-    def inner(self) -> Estimator:
-        """The estimator of the values, without what weighs records."""
-        return self.estimator.inner if isinstance(self.estimator, Weighing) else self.estimator
 
     @cached_property
     def acting(self) -> Problem:

@@ -1,13 +1,11 @@
 """What is grossly wrong with a calibration: its error, its arm beside the nominal one, records that did not train; and
 what residuals may not show.
 
-Where lengths of the arm are free they grow with an instrument's scale and no residual shows it; only their priors do.
-Springs take up a payload that nobody stated. So each is estimated beside the free parameters, to first order at the
-fit, and stated with what would not show.
+Free lengths of an arm grow with an instrument's scale, springs take up a payload that nobody stated, and no residual
+shows it: each is estimated beside the free parameters, to first order, and stated with what would not show.
 
-Where all recorded angles of some joints are whole multiples of one step, each may be off by up to half of it. Such
-errors are carried to what is measured by the joints' slopes. What they would leave is compared with what is left: in
-size and, by likelihood, in how it is spread over poses and directions. Servos that stand at whole commands leave less.
+Where all recorded angles of some joints are whole multiples of one step, each may be off by up to half of it. What that
+would leave is compared with what is left: in size and, by likelihood, in how it is spread over poses and directions.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,25 +29,16 @@ from armcal.diagnose.residual_structure import CLEAR, ResidualStructure, Structu
 from armcal.errors import NotConvergedError
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import Measure, at_random_poses
+from armcal.estimate.robust import Weighing
 from armcal.estimate.start import BETTER
 from armcal.estimate.validation import Halves, halves
+from armcal.problem import rigid_alignment as rigid
 from armcal.problem.problem import Problem
-from armcal.problem.rigid_alignment import (
-    FEWEST,
-    apart_from,
-    hand_eye,
-    rigid_fit,
-    sighting_of,
-    spread_of,
-    tools,
-    tools_of,
-)
 from armcal.problem.variants import LOADS, Motion
 
 _MM = 1000.0
 BEYOND, FAR_BEYOND, IMPLAUSIBLE = 4.0, 20.0, 100.0
-"""Standard deviations of a prior, or typical corrections where there is none: what is worth a look, what is gross. Of
-what is no length or angle: how many times a plausible size is worth a look."""
+"""Standard deviations of a prior, or typical corrections: what is worth a look, and gross; times a plausible size."""
 _POSES = 60
 _FEWEST_LENGTHS = 3
 AS_MUCH, BY_SHARES = 0.004, 0.05
@@ -93,8 +82,6 @@ class Proportion:
 
 @dataclass(frozen=True)
 class Figure:
-    """The calibrated arm beside the nominal one."""
-
     reach_mm: float  # largest distance of the nominal tool from the first joint, over the poses
     size: float  # extent of the tool's positions by that with nominal lengths, all else calibrated; nan if they rest
     moved_mm: float  # how far the calibrated arm as a whole stands from where the configuration has it
@@ -113,17 +100,17 @@ def figure(fit: Fit) -> Figure:
             bent[own] = configured[own]
     vectors, poses = (configured, estimate.values, bent), at_random_poses(problem).subset(np.arange(_POSES))
     try:
-        nominal, calibrated, with_lengths = (tools(poses, values)[0][0] for values in vectors)
+        nominal, calibrated, with_lengths = (rigid.tools(poses, values)[0][0] for values in vectors)
     except NotConvergedError:
         poses = problem
-        nominal, calibrated, with_lengths = (tools(poses, values)[0][0] for values in vectors)
+        nominal, calibrated, with_lengths = (rigid.tools(poses, values)[0][0] for values in vectors)
     chain = problem.blueprint.arms[problem.blueprint.measurements[problem.kernels[0].factor.name].arms[0]].nominal_chain
     first = np.array(ca.evalf((chain.base_T_mount @ chain.joints[0].parent_T_joint).translation)).ravel()
-    extent, turn, shift = spread_of(with_lengths), *rigid_fit(nominal, calibrated)
+    extent, turn, shift = rigid.spread_of(with_lengths), *rigid.rigid_fit(nominal, calibrated)
     reach = float(np.max(np.linalg.norm(nominal - first[:, None], axis=0)))
     return Figure(
         reach_mm=reach * _MM,
-        size=spread_of(calibrated) / extent if extent > 0 else float("nan"),
+        size=rigid.spread_of(calibrated) / extent if extent > 0 else float("nan"),
         moved_mm=float(np.linalg.norm(turn @ first + shift - first)) * _MM,
         turned_deg=float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0)))),
         displaced=_displaced(poses, estimate, reach),
@@ -163,16 +150,11 @@ def _displaced(problem: Problem, estimate: Estimate, reach_m: float) -> tuple[Di
 
 
 def proportion(problem: Problem, estimate: Estimate) -> Proportion | None:
-    """By how much free lengths of an arm are longer than nominal in proportion; None where they are too few."""
-    parameters, nominal = problem.parameters, problem.blueprint.parameters.nominal()
-    chosen = [
-        problem.free_names.index(block.name)
-        for i, block in enumerate(parameters.coordinate_blocks)
-        if block.unit == "m"
-        and block.domain.dof == 1
-        and nominal[parameters.entries_of(block.name)].all()
-        and not only_places(problem, estimate.values, i)
-    ]
+    parameters, nominal, chosen = problem.parameters, problem.blueprint.parameters.nominal(), []
+    for i, block in enumerate(parameters.coordinate_blocks):
+        is_length = block.unit == "m" and block.domain.dof == 1 and nominal[parameters.entries_of(block.name)].all()
+        if is_length and not only_places(problem, estimate.values, i):
+            chosen.append(problem.free_names.index(block.name))
     if len(chosen) < _FEWEST_LENGTHS:
         return None
     entries = np.array(parameters.free_entries)[chosen]
@@ -181,25 +163,19 @@ def proportion(problem: Problem, estimate: Estimate) -> Proportion | None:
 
 OF_REACH = 0.03  # An error beyond this share of the reach, or of a radian, is gross, whatever arm and instrument are
 PREDICTED_OF_REACH, EXPLAINED_OF_REACH, EXPLAINED = 0.01, 0.02, 1 / 3
-"""Where other poses predict a third of the variance of the residuals, the model lacks what noise does not make: gross
-beyond the first share of the reach, or beyond the second where one structure makes up a third of the error, as gravity
-does of a printed arm whose base is rigid. A jump that makes up a third of the error is gross, however small."""
-OVERFITTED = (
-    3.0  # Times the noise of training records, from which on errors of records that did not train are the fit's
-)
+"""Where other poses predict a third of the variance an error is gross beyond the first share of the reach, beyond the
+second where one structure makes up a third of it, as gravity does of a printed arm; a jump that does so is always."""
+OVERFITTED = 3.0  # Times the noise of training records: larger errors of records that did not train are the fit's
 FEWEST_JUDGED = 10
 _JUMPS = frozenset({"step", "slip", "bump"})
 _OVER_TIME = _JUMPS | {"order"}
 _NO_EXCUSE = _OVER_TIME | {"scale", "held"}
 """Kinds of structure that explain no gross error: something may have moved, a frame or what is held be wrong."""
-_LOOK = (
-    "Look at what is configured and held (armcal identify --fixed), and at how records and joints were paired: armcal "
-    "check says how well the nominal arm fits."
-)
-_MOVED = (
-    "The error depends on when a record was measured: the base, the tracker or the target moved or drifted. Measure "
-    "again what differs, or calibrate the records before and after by themselves. parameters.drift models a slow drift."
-)
+_LOOK = "Look at what is configured and held (armcal identify --fixed), and at how records and joints were paired: "
+_LOOK += "armcal check says how well the nominal arm fits."
+_MOVED = "The error depends on when a record was measured: the base, the tracker or the target moved or drifted. "
+_MOVED += "Measure again what differs, or calibrate the records before and after by themselves. parameters.drift "
+_MOVED += "models a slow drift."
 SIZE, GROSS_SIZE = 0.02, 0.05  # How much larger or smaller than the nominal arm is worth a look, and gross
 EXACT = 1e-5  # Of the reach, 10 um a metre: no arm follows a model so closely, and no instrument measures it so well
 MOST_NAMED = 3
@@ -277,13 +253,13 @@ def held_turn(fit: Fit) -> str:
     for number, kernel in enumerate(problem.kernels):
         own = f"{kernel.factor.name}."
         names = [b.name for b in problem.parameters.blocks if b.name.startswith(own) and isinstance(b.domain, Rotation)]
-        sighting = sighting_of(problem, fit.dataset, number, MOST_RECORDS)
-        if sighting is None or sighting.turned is None or len(sighting.chosen) < FEWEST:
+        sighting = rigid.sighting_of(problem, fit.dataset, number, MOST_RECORDS)
+        if sighting is None or sighting.turned is None or len(sighting.chosen) < rigid.FEWEST:
             continue
         if not names or problem.parameters[names[0]].free:
             continue
-        tools = tools_of(problem.subset(sighting.chosen), nominal, number)
-        base, mounted = hand_eye(tools.rotations, sighting.turned)
+        tools = rigid.tools_of(problem.subset(sighting.chosen), nominal, number)
+        base, mounted = rigid.hand_eye(tools.rotations, sighting.turned)
         left = np.swapaxes(base @ tools.rotations @ mounted, 1, 2) @ sighting.turned
         turn, scatter = (float(np.median(Turns.from_matrix(t).magnitude())) for t in (mounted, left))
         if turn > max(OF_REACH, BETTER * scatter):
@@ -305,10 +281,8 @@ def aligned(fit: Fit) -> list[Finding]:
     after = float(np.median(seen)) if len(seen) else 0.0
     if spent >= 1 or after <= BETTER * left_mm / np.sqrt(1 - spent):
         return []
-    text = (
-        f"Far worse than the nominal arm as it was aligned before the fit: typically {digits(after)} mm on records "
-        f"that did not train, {digits(left_mm)} mm aligned."
-    )
+    text = f"Far worse than the nominal arm as it was aligned before the fit: typically {digits(after)} mm on records "
+    text += f"that did not train, {digits(left_mm)} mm aligned."
     test = f"medians, limit {BETTER / np.sqrt(1 - spent):.2g} times"
     action = "Something that places the arm or its target is held, or has a prior, elsewhere: free it, or correct it."
     free = "" if fit.errors.turns is None else fit.of(held_turn)
@@ -336,13 +310,11 @@ def displaced(fit: Fit) -> list[Finding]:
         ("warning", place, elsewhere, test, "Look for an offset or a unit; else correct the nominal values."),
         ("warning", large, [one for one in every if one.by == "size"], sized, give),
     )
-    measures = {"prior": "its prior", "size": "what is plausible"}
+    of = {"prior": "its prior", "size": "what is plausible"}
     for grade, text, group, how, do in rows:
-        listed = [
-            f"{one.name} by {digits(one.amount)} {one.unit} "
-            f"({one.times:.0f} times {measures.get(one.by, 'a typical correction')})"
-            for one in group
-        ]
+        times = [f"{one.times:.0f} times {of.get(one.by, 'a typical correction')}" for one in group]
+        pairs = zip(group, times, strict=True)
+        listed = [f"{one.name} by {digits(one.amount)} {one.unit} ({by})" for one, by in pairs]
         findings += [Finding(grade, text.format(first_few(listed, MOST_NAMED)), how, do)] if listed else []
     return findings
 
@@ -359,11 +331,9 @@ def computed(fit: Fit) -> list[Finding]:
     if not min(medians) < limit:
         return []
     grade: Grade = "bad" if medians[0] < limit else "warning"
-    text = (
-        f"The measured tips follow the {'nominal' if grade == 'bad' else 'calibrated'} arm to "
-        f"{digits(float(min(medians)))} mm, as no measured tip of an arm does: they seem to be computed from the "
-        "joints, by the controller, robot_state_publisher or a simulation."
-    )
+    text = f"The measured tips follow the {'nominal' if grade == 'bad' else 'calibrated'} arm to "
+    text += f"{digits(float(min(medians)))} mm, as no measured tip of an arm does: they seem to be computed from the "
+    text += "joints, by the controller, robot_state_publisher or a simulation."
     test = f"median, limit {limit:.2g} mm, {EXACT:g} of the arm's reach"
     return [Finding(grade, text, test, "Give what an instrument measured, not the pose that the robot reports.")]
 
@@ -381,13 +351,16 @@ def size(fit: Fit) -> list[Finding]:
     if lengths is None or not lengths.is_clear:
         return []
     share, sd = 100 * abs(lengths.share), 100 * lengths.sd
-    text = (
-        f"The {lengths.count} free lengths of the arm are {share:.2g} % (sd {sd:.1g} %) "
-        f"{'longer' if lengths.share > 0 else 'shorter'} than nominal, in proportion: a known distance or an "
-        "instrument's scale that is off by as much shows in nothing else."
-    )
+    text = f"The {lengths.count} free lengths of the arm are {share:.2g} % (sd {sd:.1g} %) "
+    text += f"{'longer' if lengths.share > 0 else 'shorter'} than nominal, in proportion: a known distance or an "
+    text += "instrument's scale that is off by as much shows in nothing else."
     levels = f"{100 * AS_MUCH:g} % against lengths off by as much, {100 * BY_SHARES:g} % by shares of their own"
     return [Finding("warning", text, f"regression on the nominal lengths, t, {levels}", action)]
+
+
+def by_halves(fit: Fit) -> Halves | None:
+    inner = fit.estimator.inner if isinstance(fit.estimator, Weighing) else fit.estimator
+    return halves(fit.acting, inner, fit.estimate.values) if fit.converged else None
 
 
 def worse(fit: Fit) -> list[Finding]:
@@ -397,9 +370,8 @@ def worse(fit: Fit) -> list[Finding]:
 def overfit(fit: Fit) -> list[Finding]:
     """Errors of records that did not train beside those that did; bad where the nominal arm they placed is as good.
 
-    A fit that spends p of m equations leaves sqrt(1 - p/m) of the noise in the records that train it. Records that did
-    not train have sqrt(1 + p / (m - p - 1)) times the noise where poses are alike [Breiman1983]: three times only if p
-    is eight ninths of m, or if poses are not alike. Of a pose residual it is not known how much freedom it takes up.
+    A fit that spends p of m equations leaves sqrt(1 - p/m) of the noise in records that train, and in others like them
+    sqrt(1 + p / (m - p - 1)) times the noise [Breiman1983]. How much freedom a pose residual takes up is not known.
     """
     errors, arms = fit.errors, fit.problem.blueprint.arms
     if any(arm.residual is not None and arm.residual.is_learned for arm in arms.values()):
@@ -413,10 +385,8 @@ def overfit(fit: Fit) -> list[Finding]:
     after = float(np.median(judged))
     if after <= OVERFITTED * noise:
         return []
-    text = (
-        f"Overfitted: records that did not train have an error of {after:.3g} {fit.unit}, {after / noise:.1f} times "
-        f"what the training records lead one to expect ({noise:.3g} {fit.unit})."
-    )
+    text = f"Overfitted: records that did not train have an error of {after:.3g} {fit.unit}, {after / noise:.1f} times "
+    text += f"what the training records lead one to expect ({noise:.3g} {fit.unit})."
     test = f"medians; {equations - freedom:.0f} of {equations} equations are spent on parameters; limit {OVERFITTED:g}"
     action = "Measure more poses, more different ones; free fewer parameters; or give priors."
     both = np.isfinite(fit.judged_mm) & np.isfinite(errors.rival_mm)
@@ -424,16 +394,7 @@ def overfit(fit: Fit) -> list[Finding]:
     return [Finding("warning" if gains else "bad", text, test, action)]
 
 
-def by_halves(fit: Fit) -> Halves | None:
-    return halves(fit.acting, fit.inner, fit.estimate.values) if fit.converged else None
-
-
 WORSE, POWER = 0.005, 0.9  # Level of a loss against the nominal arm; share of losses of the size stated that is found
-
-
-def _by_chance(differences: Array, level: float) -> float:
-    count = len(differences)
-    return float(stdtrit(count - 1, 1 - level) * np.std(differences, ddof=1) / np.sqrt(count))
 
 
 def worse_than_nominal(judged_mm: Array, nominal_mm: Array, spent: float = 0.0, unit: str = "mm") -> list[Finding]:
@@ -443,21 +404,20 @@ def worse_than_nominal(judged_mm: Array, nominal_mm: Array, spent: float = 0.0, 
     nothing is wrong: ``spent`` is p / (m - 1). What is more than that, and more than chance, is worse.
     """
     seen = np.isfinite(judged_mm) & np.isfinite(nominal_mm)
-    if np.count_nonzero(seen) < 2 or spent >= 1:
+    count = np.count_nonzero(seen)
+    if count < 2 or spent >= 1:
         return []
     after, before = float(np.mean(judged_mm[seen])), float(np.mean(nominal_mm[seen]))
     if after <= before:
         return []
     factor = 1 / np.sqrt(1 - spent)
     more = judged_mm[seen] - factor * nominal_mm[seen]
-    least = _by_chance(more, WORSE) + _by_chance(more, 1 - POWER)
-    which = f"on {len(more)} records that did not train it: {readable(after)} {unit} on average, {readable(before)} of "
+    chance, missed = stdtrit(count - 1, [1 - WORSE, POWER]) * np.std(more, ddof=1) / np.sqrt(count)
+    which = f"on {count} records that did not train it: {readable(after)} {unit} on average, {readable(before)} of "
     which += "the nominal arm, placed by the records that trained as far as it may move."
-    test = (
-        f"paired differences, one-sided, {100 * WORSE:g} %, beyond the {percent(factor - 1)} that so many parameters "
-        f"make; {100 * POWER:g} % of losses of {readable(least)} {unit} would show"
-    )
-    if np.mean(more) <= _by_chance(more, WORSE):
+    test = f"paired differences, one-sided, {100 * WORSE:g} %, beyond the {percent(factor - 1)} that so many "
+    test += f"parameters make; {100 * POWER:g} % of losses of {readable(float(chance + missed))} {unit} would show"
+    if np.mean(more) <= chance:
         action = "Nothing is gained by it on poses like these: keep the nominal arm, or measure more poses."
         return [Finding("note", f"No better than the nominal arm {which}", test, action)]
     action = "Do not use it. Look at what trained: too few postures, too much alike, or some of them wrong."
@@ -475,11 +435,9 @@ _LEAST_SHARE = 0.1  # A parameter that takes up less of it is not named
 
 @dataclass(frozen=True)
 class Rounding:
-    """Commands of joints that seem to have been rounded."""
-
     step: float  # of which they are whole multiples (rad or m)
     unit: str  # in which it was sought
-    joints: tuple[str, ...]  # by channel
+    joints: tuple[str, ...]  # whose commands seem to have been rounded, by channel
     leaves: float  # what it alone leaves, root mean square over records, in thousandths of the SI unit of errors
     residual: float  # what the fit leaves, likewise
     log_odds: float  # of this rounding beside even noise, against even noise alone
@@ -494,12 +452,9 @@ def rounding(fit: Fit) -> Rounding | None:
     predicted = outcome.share if outcome is not None else 0.0
     problem = fit.few.subset(train).weighted(fit.fitted.weights)
     share = min(1.0, max(estimate.degrees_of_freedom, 1.0) / max(problem.equations(), 1))
-    chosen = thinned(np.arange(len(train)))
-    problem, dataset, motion = (
-        problem.subset(chosen),
-        fit.dataset.subset(train[chosen]),
-        fit.motion.subset(train[chosen]),
-    )
+    chosen = thinned(train)
+    dataset, motion = fit.dataset.subset(chosen), fit.motion.subset(chosen)
+    problem = problem.subset(thinned(np.arange(len(train))))
     rows = FitRows.of(problem, estimate)
     left = rows.residual[rows.by_record] / np.sqrt(share)
     count = int(np.count_nonzero(left))
@@ -559,28 +514,23 @@ def rounded(fit: Fit) -> list[Finding]:
     arms = list(dict.fromkeys(channel.partition(".")[0] for channel in rounds.joints))
     names = [channel if len(arms) > 1 else channel.partition(".")[2] for channel in rounds.joints]
     turning, step = unit(rounds.unit).dimension == "angle", digits(to_unit(rounds.step, rounds.unit), 4)
-    text = (
-        f"All recorded {'angles' if turning else 'travels'} of {first_few(names, len(names))} are multiples of {step} "
-        f"{rounds.unit}. If they were rounded while the arm stood between them, that alone leaves "
-        f"{digits(rounds.leaves)} {fit.unit} (root mean square); the fit leaves {digits(rounds.residual)} "
-        f"{fit.unit}, spread over poses and directions as errors of rounding are."
-    )
+    text = f"All recorded {'angles' if turning else 'travels'} of {first_few(names, len(names))} are multiples of "
+    text += f"{step} {rounds.unit}. If they were rounded while the arm stood between them, that alone leaves "
+    text += f"{digits(rounds.leaves)} {fit.unit} (root mean square); the fit leaves {digits(rounds.residual)} "
+    text += f"{fit.unit}, spread over poses and directions as errors of rounding are."
     test = f"variances within a factor of {COMPARABLE:g}; likelihood against even noise, over 20 to 1"
     action = "Record where the joints stand, with all digits."
     if turning:
         sd = digits(to_unit(rounds.step / np.sqrt(12), "deg"))
         keys = " and ".join(f"arms.{arm}.joint_noise_deg: {sd}" for arm in arms)
         action += f" If that cannot be, state what they are off by: {keys}."
-    return [
-        Finding("warning", text, test, f"{action} If nothing was rounded, the joints miss their commands by as much.")
-    ]
+    action += " If nothing was rounded, the joints miss their commands by as much."
+    return [Finding("warning", text, test, action)]
 
 
 @dataclass(frozen=True)
 class HiddenPayload:
-    """A mass at the payload's place."""
-
-    sd: float  # its standard deviation if it were free beside the parameters and their priors (kg)
+    sd: float  # of a mass at the payload's place, if it were free beside the parameters and their priors (kg)
     taken_up: float  # the share of what it does to the residuals that parameters make up for
     by: tuple[str, ...]  # those that make up most of it, the first most
 
@@ -590,10 +540,7 @@ def scale_deviation(
 ) -> float | None:
     """Standard deviation of an instrument's scale, or of all known distances', if it were free beside the parameters;
     None with neither. ``positions`` is what each factor should read (3 x N, or 0 x N; m) in the rows' records."""
-    raw, tied = (
-        [np.zeros((len(k.factor.noise), len(rows.by_record), 1)) for k in problem.kernels],
-        problem.tie_rows(values),
-    )
+    tied, raw = problem.tie_rows(values), [np.zeros((len(k.factor.noise), problem.count, 1)) for k in problem.kernels]
     for column, position in zip(raw, positions, strict=True):
         column[: len(position), :, 0] = position
     scaled = rows.columns(raw)
@@ -603,7 +550,7 @@ def scale_deviation(
         # A distance of places is what it changes by as these grow in proportion [Euler's theorem].
         own = slice(len(rows.record_of), len(rows.record_of) + len(tied.residual))
         scaled[own, 0] = tied.jacobian @ values[list(problem.parameters.free_entries)] - tied.residual
-    left = float(np.linalg.norm(apart_from(rows.slopes, scaled)))
+    left = float(np.linalg.norm(rigid.apart_from(rows.slopes, scaled)))
     return noise_scale / left if left > 0 else float("inf")
 
 
@@ -622,16 +569,13 @@ def scale(fit: Fit) -> list[Finding]:
 
     findings = []
     if instrument_sd is not None:
-        text = (
-            f"The answer is in the instrument's frame: in it the arm stands {digits(own.moved_mm)} mm and "
-            f"{digits(own.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's scale "
-        )
+        text = f"The answer is in the instrument's frame: in it the arm stands {digits(own.moved_mm)} mm and "
+        text += f"{digits(own.turned_deg, 2)} deg from where the configuration has it. An error of the instrument's "
+        text += "scale "
         action = "Measure a known length with the instrument, if the scale matters."
         if not any(map(len, read)):  # no instrument has a scale, but known distances have
-            text = (
-                "The arm's size rests on the known distances alone: 1 % of them is 1 % of all its lengths "
-                f"({digits(0.01 * own.reach_mm, 2)} mm at the arm's reach), and an error of them "
-            )
+            text = "The arm's size rests on the known distances alone: 1 % of them is 1 % of all its lengths "
+            text += f"({digits(0.01 * own.reach_mm, 2)} mm at the arm's reach), and an error of them "
             action = "Measure these distances again, by other means; or train on a longer one."
         test = "two standard deviations of a scale beside the parameters"
         findings.append(Finding("note", f"{text}{unseen(instrument_sd)}.", test, action))
@@ -650,7 +594,6 @@ def scale(fit: Fit) -> list[Finding]:
 
 
 def hidden_payload(fit: Fit) -> HiddenPayload | None:
-    """By a fit's weighted training records; None where no payload moves the arm, or records or parameters state it."""
     if not fit.converged:
         return None
     problem, motion, estimate = fit.few_acting, fit.motion.subset(fit.split.train), fit.estimate
@@ -673,9 +616,7 @@ def payload(fit: Fit) -> list[Finding]:
     hidden = fit.of(hidden_payload)
     if hidden is None:
         return []
-    text = (
-        f"A payload of up to {digits(2000 * hidden.sd, 2)} g that hangs at the tool without being stated would not "
-        f"show: {first_few(hidden.by, MOST_NAMED)} would take up {100 * hidden.taken_up:.0f} % of what it does."
-    )
+    text = f"A payload of up to {digits(2000 * hidden.sd, 2)} g that hangs at the tool without being stated would not "
+    text += f"show: {first_few(hidden.by, MOST_NAMED)} would take up {100 * hidden.taken_up:.0f} % of what it does."
     test = "two standard deviations of a mass beside the free parameters"
     return [Finding("note", text, test, "Weigh what hangs on the tool, and state it: statics.payload_g.")]

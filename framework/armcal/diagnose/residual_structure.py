@@ -1,15 +1,14 @@
 """What is left in the residuals of a calibration: one procedure, with one level for all that is tried.
 
-Residuals of a fit are noise less what the fit took up. Everything that may be in them is tried at once: causes, sets of
-columns, by score tests [Rao1948] with a covariance from blocks of neighbouring records [Liang1986]; smooth functions of
-the pose, and of time, by their odds [Rasmussen2006]; likeness of neighbours; what the scatter may depend on, by
-regression of squares [Koenker1981]. The residuals themselves with random signs, one a pose, and squares in random order
-say what chance does [Liu1988], and the smallest of all p-values keeps the level [Westfall1993]: neither uneven noise
-nor wild records pass for structure.
+Everything that may be in them is tried at once: causes, sets of columns, by score tests [Rao1948] with a covariance
+from blocks of neighbouring records [Liang1986]; smooth functions of the pose, and of time, by their odds
+[Rasmussen2006]; likeness of neighbours; what the scatter may depend on, by regression of squares [Koenker1981]. The
+residuals themselves with random signs, one a pose, and squares in random order say what chance does [Liu1988], and the
+smallest of all p-values keeps the level [Westfall1993].
 
 The cause that explains most for its size [Schwarz1978] is taken into the model, and everything is tried again on what
 is left. Each that was found is then set against all others, against a smooth function of pose or time, which stands for
-what is not among them, and against chance, by the odds: it is named alone only where it is clearly the likeliest.
+what is not among them, and against chance: it is named alone only where it is clearly the likeliest.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -22,34 +21,21 @@ from scipy.special import chdtrc, chdtri, fdtrc
 
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.units import SMALLEST_SHOWN, digits, readable
-from armcal.diagnose.causes import (
-    WILD,
-    Cause,
-    Functions,
-    Records,
-    Smooth,
-    causes_of,
-    moves_of,
-    predicted_positions,
-    scatter_features,
-    with_contradicted,
-)
+from armcal.diagnose.causes import WILD, Cause, Functions, Records, Smooth, causes_of, scatter_features
 from armcal.diagnose.checks import Finding
 from armcal.diagnose.fit import SMALLEST, Fit, FitRows, basis_of, lag_one, own_basis
-from armcal.estimate.identifiability import Measure, candidates
+from armcal.estimate.identifiability import Measure
 from armcal.estimate.validation import automatic_block_length
 from armcal.measure.groups import PairedMeasurement, pose_numbers
 
 LEVEL = 0.01  # Of everything that is tried together: so often something is said of sound data
-_NEAR, _FAR_LESS = 0.05, 0.9
-"""Of rivals of a cause that is significant: beyond this level one is none, and what it leaves is so much less."""
+_NEAR, _FAR_LESS = 0.05, 0.9  # Of rivals of a significant cause: level beyond which one is none, and what it leaves
 CLEAR = 3.0  # Logarithm of the odds, 20 to 1, from which on one explanation is preferred
 FEWEST_RECORDS = 30
 FEWEST_POSES = 40  # Distinct poses below which nothing is said of functions of the pose
 MOST_RECORDS = 1000
 WORTHWHILE = 0.01
-DRAWS, FEWER_DRAWS = 999, 299
-"""Of chance: for the test that decides whether anything is named; in those after it, and where they show enough."""
+DRAWS, FEWER_DRAWS = 999, 299  # Of chance: for the test that decides whether anything is named; where fewer show enough
 OVER_TIME = ("order", "step", "slip", "bump")  # Kinds of causes
 UNLISTED = "something that is none of these"
 CHANGING = "something that changes with time and is none of these"
@@ -99,10 +85,8 @@ class Carrier:
 
 @dataclass(frozen=True)
 class Predicted:
-    """What records predict of the residuals of other poses, by smooth functions of the pose and of time."""
-
-    by_pose: float  # share of the squared residuals, of records left out
-    by_time: float
+    by_pose: float  # share of the squared residuals of records left out, by smooth functions of the pose
+    by_time: float  # by those of time
     pose: float  # logarithm of the odds against noise alone
     time: float
     time_imitated: float  # which share of its function the pose predicts, or of the records' order
@@ -125,8 +109,6 @@ class Predicted:
 
 @dataclass(frozen=True)
 class Scatter:
-    """What the scatter of residuals depends on."""
-
     words: str  # as the end of a sentence
     p_value: float  # that it does not, over everything that was tried
     low: float  # in units of the declared noise, in the third of the records with the least of it
@@ -136,8 +118,6 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Repeats:
-    """What records of one pose say of noise."""
-
     scatter_mm: float  # of a record about the mean of its pose (root mean square)
     left_mm: float  # of all residuals (root mean square)
     records: int  # that are repeats
@@ -146,14 +126,11 @@ class Repeats:
 
     @property
     def exceeded(self) -> bool:
-        """At 1 %; and three times, as no model is perfect."""
-        return self.p_value < _LACK and self.left_mm > _TIMES_REPEATS * self.scatter_mm
+        return self.p_value < _LACK and self.left_mm > _TIMES_REPEATS * self.scatter_mm  # no model is perfect
 
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """What the residuals of a fit still depend on."""
-
     structures: tuple[Structure, ...]  # in the order in which they were taken into the model
     more: bool  # whether something was significant still when the search ended
     share: float  # of the squared residuals, what is no noise: causes take it up, or other records predict it
@@ -195,20 +172,17 @@ def structure(fit: Fit) -> ResidualStructure | None:
     """Try the residuals of a fit to records, with the weights they had; None where there are too few to judge."""
     if not fit.converged:
         return None
-    problem, estimate, train = with_contradicted(fit, fit.few_acting), fit.estimate, fit.split.train
-    acting = np.flatnonzero(np.any([record.weight[: record.count] > 0 for record in problem.records], axis=0))
-    chosen = acting[np.argsort(fit.position[train][acting], kind="stable")]
+    position, plan = fit.position[fit.split.train], fit.problem.blueprint
+    acting = np.flatnonzero(np.any([one.weight[: one.count] > 0 for one in fit.few_acting.records], axis=0))
+    chosen = acting[np.argsort(position[acting], kind="stable")]
     if len(chosen) < FEWEST_RECORDS:
         return None
     if len(chosen) > MOST_RECORDS:  # runs of neighbours
         runs = np.array_split(chosen, 2 * len(chosen) // MOST_RECORDS)
         chosen = np.concatenate([run[: MOST_RECORDS // len(runs)] for run in runs])
-    problem, dataset, plan = problem.subset(chosen), fit.ready.trained.subset(chosen), problem.blueprint
-    rows, read = FitRows.of(problem, estimate), predicted_positions(problem, estimate.values, dataset)
-    moves = moves_of(problem, estimate.values, candidates(problem.parameters))
-    here = Records(problem, rows, dataset, fit.motion.subset(train[chosen]), read, moves)
+    here = Records.of(fit, chosen)
     causes = list(causes_of(here))
-    columns = [rows.columns(one.columns) for one in causes]
+    columns = [here.rows.columns(one.columns) for one in causes]
     # What a held parameter of a joint's effect does as well, a spring's or a gear's, is named as that parameter.
     effects = {f"{name}.{effect}" for name, arm in plan.arms.items() for effect in arm.effects}
     unit = [column / max(float(np.linalg.norm(column)), 1e-300) for column in columns]
@@ -223,22 +197,20 @@ def structure(fit: Fit) -> ResidualStructure | None:
         [causes[i] for i in kept],
         [columns[i] for i in kept],
         [(words, f) for words, f in scatter_features(here) if np.ptp(f) > 1e-9 * max(1.0, np.abs(f).max())],
-        pose_numbers(dataset, here.motion.channels),
-        np.diff(fit.position[train][chosen]) == 1,
+        pose_numbers(here.dataset, here.motion.channels),
+        np.diff(position[chosen]) == 1,
     )
     described = (fit.system.description.get("arms") or {}).values()
     modelled = {str(effect.get("type")) for arm in described for effect in (arm.get("effects") or {}).values()}
     learnable = None
     if not any(arm.residual for arm in plan.arms.values()):
         paired = any(isinstance(measurement, PairedMeasurement) for measurement in plan.measurements.values())
-        learnable = not paired and all(kernel.factor.output_channels for kernel in problem.kernels)
+        learnable = not paired and all(kernel.factor.output_channels for kernel in fit.problem.kernels)
     return contest.outcome(modelled, learnable)
 
 
 @dataclass(frozen=True)
 class Tried:
-    """Everything that was tried on a residual, with p-values over all of it."""
-
     left: Sequence[tuple[int, Array]]  # causes that are not in the model, each with its basis
     shares: Array  # of the squared residual, how much each of them would take up
     p_values: Array  # of each of them
@@ -250,8 +222,6 @@ class Tried:
 
 @dataclass(frozen=True)
 class Contest:
-    """Everything that may explain the residuals of a fit."""
-
     recorded: Records
     causes: Sequence[Cause]
     columns: Sequence[Array]  # of each (rows x k)
@@ -296,11 +266,9 @@ class Contest:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """What stands for one cause: a jump is one wherever it is, a drift of the whole any function of time."""
-        names = []
-        for cause in self.causes:
-            once = f"{cause.kind} {cause.subject}" if cause.jumps else cause.words
-            names.append(CHANGING if cause.kind == "order" and not cause.subject else once)
-        return tuple(names)
+        once = [f"{one.kind} {one.subject}" if one.jumps else one.words for one in self.causes]
+        whole = [one.kind == "order" and not one.subject for one in self.causes]
+        return tuple(CHANGING if drifts else name for name, drifts in zip(once, whole, strict=True))
 
     def outcome(self, modelled: Collection[str], learnable: bool | None) -> ResidualStructure:
         chosen, first, last = self._search()
@@ -420,11 +388,8 @@ class Contest:
         return np.asarray(both - basis @ (basis.T @ both))
 
     def _score_tests(self, bases: Sequence[Array], both: Array) -> Array:
-        """P-values of sums of block products by their own spread (bases x m); 1 where blocks are too few.
-
-        T = s' (sum of s_b s_b')^-1 s is at most the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k) for
-        independent normal blocks.
-        """
+        """P-values of sums of block products by their own spread (bases x m); 1 where blocks are too few. T =
+        s' (sum of s_b s_b')^-1 s is at most the number of blocks B, and (B - k)/k T/(B - T) follows F(k, B - k)."""
         p_values, by_size = np.ones((len(bases), both.shape[1])), dict[int, list[int]]()
         for i, basis in enumerate(bases):
             by_size.setdefault(basis.shape[1], []).append(i)
@@ -530,9 +495,8 @@ class Contest:
     def _settled(self, chosen: Mapping[int, float], worth: float) -> dict[int, tuple[float, float, tuple[str, ...]]]:
         """Causes with p-value, share of the odds and alternatives, each beside the others: the likeliest in its place.
 
-        None that chance beats, and none with less than 1 % of the odds: what then is left is none of the causes.
-        ``worth`` is how much of a record each record is, where neighbours err alike. The best of many causes is
-        significant in some recordings of nothing but noise; odds say which of them are chance.
+        None that chance beats, and none with less than 1 % of the odds. The best of many causes is significant in some
+        recordings of nothing but noise; ``worth`` is how much of a record each is, where neighbours err alike.
         """
         settled, p_values = list(chosen), list(chosen.values())
         while True:
@@ -555,10 +519,7 @@ class Contest:
             del settled[least], p_values[least]
 
     def _odds(self, cause: int, others: Sequence[int], worth: float) -> tuple[float, tuple[str, ...], float]:
-        """A cause's share of the odds, beside others in the model; what it does not beat 20 to 1; chance's share.
-
-        Of all causes, of what is not among them, and of chance.
-        """
+        """A cause's share of the odds of all, beside others in the model; what it does not beat 20 to 1; chance's."""
         residual, basis = self.beside(others)
         gains = self._gains(residual, basis, others, worth)
         shown = dict.fromkeys(self.names, -np.inf)
@@ -632,25 +593,22 @@ def _size(one: Cause, coefficients: Array) -> str:
     """Its coefficients in a customary unit, of levels the largest."""
     if not one.labels or not one.unit:
         return ""
-    numbers = coefficients[: len(one.labels)]
-
-    def shown(number: float) -> str:
-        value, unit = (100 * number, "%") if one.unit == "1" else Measure(one.unit, 1.0).shown(number)
-        return f"{value:.2g} {unit}"
-
-    if one.kind == "level":
-        largest = int(np.argmax(np.abs(numbers)))
-        return f"{shown(float(numbers[largest]))} off at {one.labels[largest]}, beside its other levels"
+    numbers, shown = [float(number) for number in coefficients[: len(one.labels)]], list[str]()
     if one.kind == "delay":
         late_ms = float(f"{1000 * numbers[0]:.2g}")
         return f"joints {'late' if late_ms > 0 else 'early'} by about {abs(late_ms):g} ms, to first order"
-    return ", ".join(f"{label}: {shown(float(n))}" for label, n in zip(one.labels, numbers, strict=True))
+    for number in numbers:
+        value, unit = (100 * number, "%") if one.unit == "1" else Measure(one.unit, 1.0).shown(number)
+        shown.append(f"{value:.2g} {unit}")
+    if one.kind == "level":
+        largest = int(np.argmax(np.abs(numbers)))
+        return f"{shown[largest]} off at {one.labels[largest]}, beside its other levels"
+    return ", ".join(f"{label}: {size}" for label, size in zip(one.labels, shown, strict=True))
 
 
 _MOST_TOLD = 5
 _LIKELY = 0.05  # A cause with less of the odds is not named first
-_NO_NOISE = 0.01
-"""Of the declared noise: residuals below it are a simulation's without noise, and how they vary means nothing."""
+_NO_NOISE = 0.01  # Of the declared noise: residuals below it are a simulation's without noise
 
 
 def depends(fit: Fit) -> list[Finding]:
@@ -742,12 +700,12 @@ def _remedies(rest: Predicted, learnable: bool | None) -> Iterator[str]:
         if learnable is False:
             yield "A pose residual cannot learn it from these records: that takes positions or poses of the tool."
         yield "Free what armcal identify --fixed recommends, or add effects to these joints; more poses show more."
-    if "temperature" in kinds:
-        yield "Add thermal_length, or measure at one temperature."
-    if "payload" in kinds:
-        yield "Weigh the payload; add or free compliance."
-    if "approach" in kinds:
-        yield "Add or free approach_backlash on these joints."
+    others = {
+        "temperature": "Add thermal_length, or measure at one temperature.",
+        "payload": "Weigh the payload; add or free compliance.",
+        "approach": "Add or free approach_backlash on these joints.",
+    }
+    yield from (text for kind, text in others.items() if kind in kinds)
 
 
 _WHY = {
@@ -771,10 +729,8 @@ def repeated(fit: Fit) -> list[Finding]:
     outcome, unit = fit.of(structure), fit.unit
     if outcome is None or (repeats := outcome.repeats) is None or not repeats.exceeded:
         return []
-    text = (
-        f"Repeats of a pose scatter by {readable(repeats.scatter_mm)} {unit}, residuals are "
-        f"{readable(repeats.left_mm)} {unit} (root mean squares): "
-    )
+    text = f"Repeats of a pose scatter by {readable(repeats.scatter_mm)} {unit}, residuals are "
+    text += f"{readable(repeats.left_mm)} {unit} (root mean squares): "
     test = f"lack of fit, F over {repeats.records} records of {repeats.poses} poses, p {_p(repeats.p_value)}, and "
     test += f"{_TIMES_REPEATS:g} times"
     if outcome.shows:

@@ -15,11 +15,10 @@ from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import digits, readable
 from armcal.diagnose.causes import contradictions
 from armcal.diagnose.checks import FIT_CHECKS, Finding, first_few, plugin_checks
-from armcal.diagnose.coverage import predictions
 from armcal.diagnose.data import still_joints
 from armcal.diagnose.fit import Fit
 from armcal.diagnose.gross import by_halves, hidden_payload, rounding
-from armcal.diagnose.outliers import MOST_TOLD, component_findings, large_errors
+from armcal.diagnose.record_checks import MOST_TOLD, component_findings, large_errors, predictions
 from armcal.diagnose.residual_structure import structure
 from armcal.estimate.estimator import AT_BOUND, CHECK_THE_DATA, Estimate
 from armcal.estimate.identifiability import (
@@ -40,8 +39,7 @@ from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions
 
 LEVEL = 0.05
-SURE = 0.005
-"""Level of a warning: those of all checks add up to at most 5 % of sound runs."""
+SURE = 0.005  # Level of a warning: those of all checks add up to at most 5 % of sound runs
 SHARE = 0.95
 FEWEST_FREEDOM = 10
 DO_NOT_USE = "Do not use this calibration"
@@ -57,8 +55,6 @@ _ORDER = {"bad": 0, "warning": 1, "note": 2, "good": 3}
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """How well contacts determine the tool away from them, where their own errors say nothing."""
-
     rms_mm: float  # root mean square of the tool's distance from where it is predicted, for the parameters' uncertainty
     poses: int  # how many unseen poses were looked at
     up_to: str  # motions that were left out, because nothing that was measured sees them; empty where none were
@@ -81,9 +77,7 @@ def away(fit: Fit) -> list[Finding]:
 
 @dataclass(frozen=True)
 class PriorsAlone:
-    """What combinations that only priors hold do to the tip."""
-
-    worst_mm: float  # the largest standard deviation of the tip that they leave, over the poses looked at
+    worst_mm: float  # the largest standard deviation of the tip that what only priors hold leaves, over unseen poses
     between_mm: float  # the same where joints stand between recorded positions too, approached from any recorded side
     poses: int  # how many unseen poses of each kind were looked at
 
@@ -277,7 +271,6 @@ def new_recording(fit: Fit) -> NewRecording | None:
 
 
 def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
-    """Poses to measure next, joints that stood still elsewhere; none after a fit that did not converge."""
     problem, estimate, dataset = fit.problem, fit.estimate, fit.ready.trained
     # In a contact no pose can be chosen that does not touch.
     chosen = all(kernel.factor.output_channels for kernel in problem.kernels)
@@ -291,7 +284,7 @@ def suggestions(fit: Fit) -> tuple[Suggestion, ...]:
             channel = f"{name}.{joint}"
             joints[channel] = kind
             limits[channel] = stated.get(joint if len(arms) == 1 else channel, own[joint])
-    still = {channel: limits[channel] for channel in still_joints(fit.system, dataset)}
+    still = {channel: limits[channel] for channel in fit.of(still_joints)}
     return suggest(problem, dataset, estimate, joints, still=still)
 
 
@@ -303,17 +296,10 @@ def evidence(fit: Fit) -> dict[str, Any]:
 
 
 def _good_for(
-    judged_mm: Array,
-    judged_on: str,
-    unit: str = "mm",
-    new: NewRecording | None = None,
-    elsewhere: Elsewhere | None = None,
+    judged_mm: Array, judged_on: str, unit: str = "mm", new: NewRecording | None = None, away: Elsewhere | None = None
 ) -> str:
-    """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics. [Wilks1941]
-
-    In a new recording a drift is another one: errors are scaled to it, and the limit is as much wider as an upper
-    limit of the mean square is for so many fewer degrees of freedom.
-    """
+    """Below what 95 % of unseen poses lie, with 95 % confidence, by order statistics [Wilks1941]; of a new recording,
+    whose drift is another one, as much wider as an upper limit of the mean square is for fewer degrees of freedom."""
     count = len(judged_mm)
     if not count:
         return "How good the model is on unseen poses is not known: hold records out, or cross-validate."
@@ -325,7 +311,7 @@ def _good_for(
     if new is not None:
         correlated, independent = (freedom / chdtri(freedom, 1 - LEVEL) for freedom in (new.freedom, new.independent))
         limit *= float(np.sqrt(correlated / independent))
-    claim = "Good for" if elsewhere is None else f"{elsewhere.in_words}. Postures at one place agree within"
+    claim = "Good for" if away is None else f"{away.in_words}. Postures at one place agree within"
     within = f"{claim} +- {readable(limit)} {unit} on unseen poses like these"
     return f"{within}: 95 % of them, with 95 % confidence ({judged_on})."
 
@@ -422,7 +408,6 @@ def correlated(fit: Fit) -> list[Finding]:
 
 
 def next_poses(fit: Fit) -> list[Finding]:
-    """The parameter whose uncertainty is largest in its own typical scale, and the poses that would add most."""
     estimate, suggested = fit.estimate, fit.of(suggestions)
     if not estimate.names:
         return []
@@ -443,7 +428,6 @@ def found_before(fit: Fit) -> list[Finding]:
 
 
 def shifts(fit: Fit) -> list[Finding]:
-    """Which estimates are moved by bounds and cones that hold others, and by how many standard deviations."""
     estimate, blocks = fit.estimate, set[str]()
     for block in estimate.parameters.free:
         at_edge = not set(block.entry_names).isdisjoint(estimate.at_bound)
@@ -474,17 +458,16 @@ def places(fit: Fit) -> list[Finding]:
 def known_accuracies(problem: Problem, estimate: Estimate, parts: Halves | None = None) -> list[str]:
     texts = []
     for name, measurement in problem.blueprint.measurements.items():
-        if not isinstance(measurement, Placed):
-            continue
-        pose, where = measurement.place
-        mm, deg = (_NORMAL_95 * size for size in pose_size(own_deviations(estimate, name), pose))
-        if np.isnan(mm + deg):
-            continue
-        text = f"{name}: its place {where} is known to {mm:.2g} mm and {deg:.2g} deg (95 %)"
-        if parts is not None and np.isfinite(parts.apart[name]).any():
-            mm, deg = np.nanmean(parts.apart[name], axis=0)
-            text += f", and differs by {mm:.2g} mm and {deg:.2g} deg between halves of the records"
-        texts.append(f"{text}.")
+        if isinstance(measurement, Placed):
+            pose, where = measurement.place
+            mm, deg = (_NORMAL_95 * size for size in pose_size(own_deviations(estimate, name), pose))
+            if np.isnan(mm + deg):
+                continue
+            text = f"{name}: its place {where} is known to {mm:.2g} mm and {deg:.2g} deg (95 %)"
+            if parts is not None and np.isfinite(parts.apart[name]).any():
+                mm, deg = np.nanmean(parts.apart[name], axis=0)
+                text += f", and differs by {mm:.2g} mm and {deg:.2g} deg between halves of the records"
+            texts.append(f"{text}.")
     return texts
 
 

@@ -13,9 +13,9 @@ from armcal.arm.assembly import command_channels
 from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.domains import Semidefinite, symmetric
 from armcal.base.units import readable, shown_unit
-from armcal.diagnose import outliers
+from armcal.diagnose import record_checks
 from armcal.diagnose.checks import Finding
-from armcal.diagnose.outliers import large_errors
+from armcal.diagnose.record_checks import large_errors
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import (
     CORRELATED,
@@ -228,7 +228,7 @@ def noise_of(result: RunResult) -> tuple[Array, float] | None:
 
     None of images and of several measurements, whose errors are means over more numbers than a position has.
     """
-    noise, errors = result.fit.of(outliers.noise_of) if result.fit.converged else None, result.errors
+    noise, errors = result.fit.of(record_checks.noise_of) if result.fit.converged else None, result.errors
     rows = sum(name.endswith(f"_{errors.unit}") for name in errors.residual_columns)
     return (1000 * noise[0], noise[1]) if noise is not None and rows <= 3 else None
 

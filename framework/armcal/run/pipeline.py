@@ -15,8 +15,8 @@ from armcal.arm.statics import LOAD_CHANNELS
 from armcal.base.dataset import Dataset, SetAside
 from armcal.calibration.intervals import UNKNOWN, PredictionRecord, covariance_rows, recorded_ranges
 from armcal.diagnose.checks import DATA_CHECKS, first_few, plugin_checks
-from armcal.diagnose.coverage import fit_and_predict, intervals
 from armcal.diagnose.fit import Fit, Prepared, widened
+from armcal.diagnose.record_checks import fit_and_predict, intervals
 from armcal.diagnose.verdict import verdict_of
 from armcal.errors import ConfigError, DataError, Location, ProblemError, noted
 from armcal.estimate.estimator import Progress, no_progress, spread

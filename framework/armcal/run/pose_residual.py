@@ -12,8 +12,8 @@ from armcal.base.arrays import Array, Indices
 from armcal.base.dataset import Dataset
 from armcal.config.system import System
 from armcal.diagnose.checks import Finding
-from armcal.diagnose.coverage import missed, predictor, whitened_like
 from armcal.diagnose.fit import Fit
+from armcal.diagnose.record_checks import missed, predictor, whitened_like
 from armcal.errors import ConfigError
 from armcal.estimate.estimator import Progress
 from armcal.estimate.robust import WeighedFit, fit, held_fit

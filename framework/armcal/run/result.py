@@ -26,8 +26,8 @@ from armcal.calibration.calibration_file import (
 )
 from armcal.calibration.intervals import PAYLOAD, PredictionRecord
 from armcal.config.system import System
-from armcal.diagnose.coverage import Intervals, intervals
 from armcal.diagnose.fit import Fit, RecordErrors
+from armcal.diagnose.record_checks import Intervals, intervals
 from armcal.diagnose.verdict import Verdict, evidence
 from armcal.errors import ArmcalError, CalibrationWarning, NotConvergedError
 from armcal.estimate.estimator import Estimate
