@@ -66,7 +66,7 @@ class FramedLink(GuardedLink, Link):
     def open(self, clock: Clock) -> LinkIdentity:
         """See ``armcal.devices.link.Link``. A board that has taken over gives the arm back: it stops where it is."""
         adapter = self._port.open()
-        self._decoder.forget()
+        self._decoder = FrameDecoder()
         self._boots, self._took_over = None, False
         try:
             until, hello = clock.now() + self._settings.start, None

@@ -4,7 +4,7 @@ import gc
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,6 @@ import click
 from armcal.base.config_text import as_line
 from armcal.calibration.tool_expression import Point
 from armcal.cli.common import Console, accept, point, speaking, within
-from armcal.errors import ArmcalError
 from armcal.functions.batch_function import EvaluatorChoice
 from armcal.io.json_server import JsonServer
 from armcal.io.lines import StandardOutput
@@ -80,7 +79,11 @@ class Server:
     def __init__(self, loader: Loader, notify: Notify) -> None:
         self._notify = notify
         self._file = CalibrationFile(loader, notify)
-        self._server = JsonServer(self._answering, self._refusal, MAX_LINE_BYTES)
+        self._server = JsonServer(
+            lambda line, arrived: self._served.begin(line, arrived, self.status),
+            lambda fault: as_line(refusal(None, fault)).encode(),
+            MAX_LINE_BYTES,
+        )
 
     def run(self, socket: Path | None) -> None:
         """Load the calibration, which may take the compiler's time, and serve the socket, or standard input and output,
@@ -110,12 +113,6 @@ class Server:
         finally:
             sys.setswitchinterval(switched)
             self._server.close()
-
-    def _answering(self, line: bytes, arrived: float) -> Iterator[bytes | None]:
-        return self._served.begin(line, arrived, self.status)
-
-    def _refusal(self, fault: ArmcalError) -> bytes:
-        return as_line(refusal(None, fault)).encode()
 
     def status(self) -> Mapping[str, Any]:
         served, file = self._served, self._file

@@ -97,15 +97,8 @@ class Loader:
             is_known = needs_payload or statics.payload is not None
             ranges = {channel: ends for channel, ends in kept.ranges.items() if channel != PAYLOAD or is_known}
             recorded = RecordedRange.of(ranges, [*(f"{name}.{joint}" for joint in arm.commanded), PAYLOAD], {name: arm})
-        return ServedArm(
-            name,
-            dict(arm.commanded),
-            self._compensator(calibration, name, (), before.compensator if before else None),
-            needs_payload,
-            heated,
-            self.point,
-            recorded,
-        )
+        compensator = self._compensator(calibration, name, (), before.compensator if before else None)
+        return ServedArm(name, dict(arm.commanded), compensator, needs_payload, heated, self.point, recorded)
 
     def _compensator(
         self, calibration: Calibration, name: str, conditions: tuple[str, ...], before: Compensator | None

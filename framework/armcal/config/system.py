@@ -123,7 +123,14 @@ class System:
 def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
     parts = replace(source, data={k: source.data[k] for k in SystemSettings.model_fields if k in source.data})
     settings = validate(SystemSettings, parts)
-    _instance_names(source, [*settings.arms, *settings.measurements])
+    names = [*settings.arms, *settings.measurements]
+    for name in names:  # they head parameter names and columns: no two are the same, and none holds a dot or a glob
+        section: Path = ("arms" if name in settings.arms else "measurements", name)
+        if names.count(name) > 1 or name == STATICS:
+            source.refuse(section, f"{name!r} names two things.", "Rename one.")
+        if not name.isidentifier():
+            hint = "Use letters, digits and underscores, beginning with a letter."
+            source.refuse(section, f"{name!r} is no instance name.", hint)
     arms, described_arms = {}, {}
     for name in settings.arms:
         arms[name], described_arms[name] = _arm(source, registry, name)
@@ -265,17 +272,6 @@ def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettin
             text += f", expected at most {farthest:.3g} m of an arm of {arm.length:.3g} m from joint to joint."
             place = (*at, mass.name) if mass.name in links else (*at[:-1], "model")
             source.refuse(place, text, "Are these millimetres? Write com_mm, or correct the URDF's inertial.")
-
-
-def _instance_names(source: ConfigSource, names: list[str]) -> None:
-    """Names head parameter names and columns, so they must not collide or hold a dot or a glob."""
-    for name in names:
-        section: Path = ("arms", name) if name in source.data.get("arms", {}) else ("measurements", name)
-        if names.count(name) > 1 or name == STATICS:
-            source.refuse(section, f"{name!r} names two things.", "Rename one.")
-        if not name.isidentifier():
-            hint = "Use letters, digits and underscores, beginning with a letter."
-            source.refuse(section, f"{name!r} is no instance name.", hint)
 
 
 def _part_names(source: ConfigSource, at: Path, kind: str, names: Collection[str], taken: Collection[str] = ()) -> None:

@@ -86,9 +86,6 @@ class FrameDecoder:
                 frames.append(Frame(body[0], body[1], body[2:-4]))
         return frames
 
-    def forget(self) -> None:
-        self._rest = b""
-
 
 def cobs_encoded(data: bytes) -> bytes:
     """The bytes without zeros; no delimiter is added."""

@@ -64,7 +64,18 @@ class SerialPort:
         try:
             self._port = serial.Serial(path, self._settings.baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, termios.error) as fault:  # pyserial's own errors are OSErrors
-            self._refuse(path, fault)
+            number = fault.errno if isinstance(fault, OSError) else None
+            if number in _TAKEN:
+                message, hint = "another program has this serial port.", f"Close it; fuser {path} says which one it is."
+            elif self._was_open:
+                self._lose(fault)
+            elif number == errno.ENOENT:
+                message, hint = "there is no such serial port.", "Plug the board in; python -m serial.tools.list_ports."
+            elif number in (errno.EACCES, errno.EPERM):
+                message, hint = "this serial port may not be opened.", "Join its group (dialout) and log in anew."
+            else:
+                message, hint = f"this serial port cannot be opened ({fault}).", "Check that the path is a serial port."
+            raise DeviceRefusedError(message, where=Location(path), hint=hint) from fault
         self._was_open = True
         return adapters[0] if adapters else ""
 
@@ -114,17 +125,3 @@ class SerialPort:
         self.close()
         text, hint = f"the serial port is gone ({why}).", "Look at its plug, cable and power."
         raise DeviceLostError(text, where=Location(str(self._settings.port)), hint=hint)
-
-    def _refuse(self, path: str, fault: Exception) -> NoReturn:
-        number = fault.errno if isinstance(fault, OSError) else None
-        if number in _TAKEN:
-            message, hint = "another program has this serial port.", f"Close it; fuser {path} says which one it is."
-        elif self._was_open:
-            self._lose(fault)
-        elif number == errno.ENOENT:
-            message, hint = "there is no such serial port.", "Plug the board in; python -m serial.tools.list_ports."
-        elif number in (errno.EACCES, errno.EPERM):
-            message, hint = "this serial port may not be opened.", "Join its group (dialout) and log in anew."
-        else:
-            message, hint = f"this serial port cannot be opened ({fault}).", "Check that the path is a serial port."
-        raise DeviceRefusedError(message, where=Location(path), hint=hint) from fault

@@ -263,7 +263,10 @@ class Journal(KeptJournal):
                 if self._database.in_transaction:
                     with suppress(sqlite3.Error):
                         self._database.rollback()
-                if fault.sqlite_errorcode == sqlite3.SQLITE_FULL or self._is_at_limit():
+                limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]  # of the files that this process may make
+                sizes = [file.stat().st_size for file in (self.path, Path(f"{self.path}-wal")) if file.exists()]
+                is_at_limit = limit != resource.RLIM_INFINITY and max(sizes, default=0) + 2 * _PAGE > limit
+                if fault.sqlite_errorcode == sqlite3.SQLITE_FULL or is_at_limit:
                     text = f"there is no room for an entry ({fault}); it was not written."
                     hint = "Make room on the disk, then start again; what was acknowledged is kept."
                     raise JournalFullError(text, where=Location(str(self.path)), hint=hint) from fault
@@ -271,12 +274,6 @@ class Journal(KeptJournal):
         text = f"the journal takes no more entries ({self._failure}). All that was acknowledged before is kept."
         hint = "Look at the disk and its quota, and for a program that holds the file locked; then start again."
         raise JournalFailedError(text, where=Location(str(self.path)), hint=hint)
-
-    def _is_at_limit(self) -> bool:
-        """Whether a file is as large as this process may make one."""
-        limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
-        sizes = [file.stat().st_size for file in (self.path, Path(f"{self.path}-wal")) if file.exists()]
-        return limit != resource.RLIM_INFINITY and max(sizes, default=0) + 2 * _PAGE > limit
 
 
 def has_journal(folder: Path) -> bool:

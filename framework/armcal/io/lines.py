@@ -71,8 +71,8 @@ class StandardOutput:
     def write(self, line: str) -> None:
         if self._stream is None or self.closed:
             return
-        data = memoryview((b"\n" if self._begun else b"") + line.encode() + b"\n")
         try:
+            data = memoryview((b"\n" if self._begun else b"") + line.encode() + b"\n")
             if self._descriptor is None:
                 self._stream.write(data)
                 self._stream.flush()
@@ -100,17 +100,12 @@ def port_of(text: str) -> int | None:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    where = Location(f"udp:{host}:{port}")
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        kind, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE)[0]
-        bound_socket = socket.socket(kind, socket.SOCK_DGRAM)
-        try:
-            bound_socket.bind(address)
-        except OSError:
-            bound_socket.close()
-            raise
-    except (OSError, UnicodeError) as fault:
-        hint = "Give a free port, and an address of this machine."
+        opened.bind((host, port))
+    except OSError as fault:
+        opened.close()
+        where, hint = Location(f"udp:{host}:{port}"), "Give a free port, and an address of this machine."
         raise InputError(f"the socket cannot be opened ({fault}).", where=where, hint=hint) from fault
-    bound_socket.setblocking(False)
-    return bound_socket
+    opened.setblocking(False)
+    return opened

@@ -59,10 +59,8 @@ def input_bytes(path: Path, most: int, expected: str, refusal: type[InputError] 
         try:
             return stream.read(most)
         except OSError as fault:
-            hint = "Check the disk it is on."
-            raise refusal(
-                f"it cannot be read ({fault.strerror or fault}).", where=Location(str(path)), hint=hint
-            ) from fault
+            text, hint = f"it cannot be read ({fault.strerror or fault}).", "Check the disk it is on."
+            raise refusal(text, where=Location(str(path)), hint=hint) from fault
 
 
 def refuse(path: Path | str, message: str, hint: str, line: int | None = None, column: str | None = None) -> NoReturn:
@@ -256,13 +254,11 @@ def check_folder(folder: Path, ours: Collection[str]) -> None:
     """Refuse a file, or a directory with anything that is not called as ours are."""
     where = Location(str(folder))
     try:
-        is_folder = folder.is_dir()
-        is_other = folder.exists() and not is_folder
-        names = {path.name for path in folder.iterdir()} if is_folder else set()
+        names = {path.name for path in folder.iterdir()} if folder.exists() else set()
     except OSError as fault:
-        raise InputError(f"it cannot be used ({fault.strerror}).", where=where, hint="Give another --out.") from fault
-    if is_other:
-        raise InputError("it is a file, expected a directory.", where=where, hint="Give another --out.")
+        is_file = isinstance(fault, NotADirectoryError)
+        text = "it is a file, expected a directory." if is_file else f"it cannot be used ({fault.strerror})."
+        raise InputError(text, where=where, hint="Give another --out.") from fault
     foreign = sorted(name for name in names - {*ours, EARLIER} if not name.startswith(STAGED))
     if foreign:
         text = f"it holds files that are not of this kind of run ({', '.join(foreign[:3])})."

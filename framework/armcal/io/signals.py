@@ -11,10 +11,7 @@ ROTATE = signal.SIGHUP
 
 
 class Signals:
-    """While it is entered: SIGTERM and SIGINT ask for the end; SIGHUP, for a new file, ends nothing by itself.
-
-    Outside the main thread there are none.
-    """
+    """While it is entered, in the main thread: SIGTERM and SIGINT ask for the end; SIGHUP ends nothing by itself."""
 
     def __init__(self, numbers: Iterable[int] = (*FINISH, ROTATE)) -> None:
         self.finish = self.rotate = False  # what was asked for
@@ -38,10 +35,7 @@ class Signals:
 
 
 class Interrupts(Signals):
-    """While it is entered it notes that Ctrl-C came (``finish``), for who calls a library that may keep it to itself.
-
-    What would take Ctrl-C otherwise takes it as well.
-    """
+    """Notes that Ctrl-C came, for who calls a library that may keep it to itself; what took it before takes it too."""
 
     def __init__(self) -> None:
         super().__init__([signal.SIGINT] if callable(signal.getsignal(signal.SIGINT)) else [])
