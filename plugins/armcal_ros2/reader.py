@@ -375,9 +375,20 @@ class MeasuredLog:
         p, q = getattr(content, position), getattr(content, orientation) if orientation else None
         self._take(time, np.array([p.x, p.y, p.z]), None if q is None else np.array([q.x, q.y, q.z, q.w]))
 
-    def close(self, place: str) -> list[str]:
-        """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for."""
+    def close(self, place: str, types: Mapping[str, str]) -> list[str]:
+        """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for.
+
+        ``types`` are those of the messages in the recording, by topic.
+        """
         s, count = self.settings, self.stamps.count
+        if types.get(s.topic) not in self.types:
+            have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
+            kind = f"the type {types[s.topic]}" if s.topic in types else "no such topic"
+            expected = ", ".join(name.rpartition("/")[2] for name in self.types)
+            hint = f"Topics that measure are {have}."
+            if types.get(s.topic) == TRANSFORMS:
+                hint = "Give reference and frame: the pose of frame in reference is read."
+            refuse(place, f"found {kind} for {self.instance} ({s.topic}), expected {expected}.", hint)
         where = f"{place}, data.measurements.{self.instance}"
         if s.reference is not None and not count:
             frames = ", ".join(sorted({*self._edges, *(edge[0] for edge in self._edges.values())}))
@@ -553,8 +564,7 @@ class Rosbag2Reader:
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
         types = {topic.name: topic.type for topic in bag.topics}
         for measured in logs:
-            self._require(measured, types)
-            remarks += measured.close(str(s.path))
+            remarks += measured.close(str(s.path), types)
         dataset = self._dataset(request, list(channels), joints, logs, [*bag.remarks, *remarks])
         return read_as(replace(dataset, sha256=digest.hexdigest()), request, by_line=False)
 
@@ -576,18 +586,6 @@ class Rosbag2Reader:
             both = " and ".join(joint.removeprefix(alone) for joint, name in channels.items() if name == twice[0])
             self._refuse(f"found {twice[0]} for {both}, expected one joint of the recording each.", "Correct names.")
         return channels
-
-    def _require(self, log: MeasuredLog, types: Mapping[str, str]) -> None:
-        topic = log.settings.topic
-        if types.get(topic) in log.types:
-            return
-        have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
-        kind = f"the type {types[topic]}" if topic in types else "no such topic"
-        expected = ", ".join(name.rpartition("/")[2] for name in log.types)
-        hint = f"Topics that measure are {have}."
-        if types.get(topic) == TRANSFORMS:
-            hint = "Give reference and frame: the pose of frame in reference is read."
-        self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
 
     def _dataset(
         self, request: ReadRequest, names: list[str], joints: JointLog, logs: Sequence[MeasuredLog], remarks: list[str]

@@ -89,13 +89,9 @@ class ServoModel(NamedTuple):
     teeth: int = 0  # of the spline on which its horn sits; 0: not known
     knows_load: bool = True  # whether its register of load has a share of its full torque, and not a current
 
-    @property
-    def map(self) -> RegisterMap:
-        return MAPS[self.protocol]
-
     def check_offset(self, offset: int) -> None:
         """Raise ValueError if a servo cannot hold a homing offset; it says what to do."""
-        limit = self.map.offset_limit
+        limit = MAPS[self.protocol].offset_limit
         if (beyond := abs(offset) - limit) <= 0:
             return
         amount = f"its horn by {math.degrees(beyond * STEP):.0f} deg or more"
