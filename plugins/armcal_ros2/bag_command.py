@@ -15,9 +15,7 @@ from armcal.errors import DataError
 from armcal.io.plain_files import refuse, require_new, write_new
 
 from armcal_ros2.reader import (
-    CAMERA_INFO,
     GUARD_S,
-    IMAGES,
     JOINT_STATE,
     MEASURED,
     TRANSFORMS,
@@ -30,6 +28,8 @@ from armcal_ros2.reader import (
     nanoseconds,
 )
 
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _MOST_FRAMES = 200
 _LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once
 
@@ -145,7 +145,7 @@ def info(console: Console, path: Path) -> None:
     if data.get("measurements"):
         _show_data(console, data, "names" in data["joints"])
     for name, topic in topics.items() if data else ():
-        if topic.type in IMAGES:
+        if topic.type in _IMAGES:
             console.line(f"Images of its rests: armcal bag images {path} --topic {name} --out FOLDER")
 
 
@@ -162,7 +162,7 @@ def images(
     """Take one image of each rest out of the recording PATH, for the reader images."""
     recording = Bag(path)
     topics, logs, remarks = survey(recording)
-    seen = _only(path, [name for name, own in topics.items() if own.type in IMAGES], topic, "images", "--topic")
+    seen = _only(path, [name for name, own in topics.items() if own.type in _IMAGES], topic, "images", "--topic")
     log = logs[_only(path, list(logs), joints, "joint states", "--joints")]
     rests = [rest for rest in log.rests if rest.end - rest.begin >= RestSettings().window]
     table, information = out / "joints.csv", out / "camera_info.yaml"
@@ -228,7 +228,7 @@ def _nearest(
     above = topic.removesuffix("/compressed").rpartition("/")[0]
     held: tuple[int, float, Any] | None = None
     for own, received, _, message in bag.messages(lambda read: read.name in (topic, f"{above}/camera_info")):
-        if own.type == CAMERA_INFO:
+        if own.type == _CAMERA_INFO:
             infos.append(message)
             continue
         time = stamps.time(nanoseconds(message.header.stamp), received)

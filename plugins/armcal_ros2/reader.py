@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -28,14 +27,12 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _PURPOSE = "reading recordings of ROS 2"
 _MOST_DELAYS = 4096
 _ZERO, _SAME = "with the stamp zero", "with the stamp of the one before"
 _EARLIER = "with a stamp before that of an earlier one"
 # A larger part of the messages, and times are not to be trusted
-_MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01})
+_MOST = {_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01}
 Clock = Literal["header", "receive"]
 
 
@@ -297,13 +294,11 @@ class JointLog:
 
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_FIELDS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {
-        "geometry_msgs/msg/PoseStamped": ("pose", "position", "orientation"),
-        "geometry_msgs/msg/PointStamped": ("", "point", ""),
-        "geometry_msgs/msg/TransformStamped": ("transform", "translation", "rotation"),
-    }
-)
+_FIELDS = {
+    "geometry_msgs/msg/PoseStamped": ("pose", "position", "orientation"),
+    "geometry_msgs/msg/PointStamped": ("", "point", ""),
+    "geometry_msgs/msg/TransformStamped": ("transform", "translation", "rotation"),
+}
 MEASURED = (*_FIELDS, TRANSFORMS)  # The types of messages that measure
 _NORM_TOLERANCE = 1e-3
 _STATIC = "/tf_static"
@@ -607,9 +602,9 @@ class Rosbag2Reader:
             if is_inverted(nominal_tools(request.arms[arm], angles), np.array([one.pose for one in own])):
                 text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm"
                 mend = f"Set inverted: {str(not log.settings.inverted).lower()} for {name}."
-                self._refuse(
-                    f"{text} does.", mend if log.settings.reference is None else "Exchange frame and reference."
-                )
+                if log.settings.reference is not None:
+                    mend = "Exchange frame and reference."
+                self._refuse(f"{text} does.", mend)
             remarks += self._clock_remarks(log, joints, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)

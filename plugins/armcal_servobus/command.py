@@ -17,7 +17,7 @@ from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
-from armcal_servobus.bus import BAUD_RATES, COUNTS, LAST_ID, STEP, Bus, BusSettings, ProtocolName, looked_at, present
+from armcal_servobus.bus import COUNTS, LAST_ID, MAPS, STEP, Bus, BusSettings, ProtocolName, looked_at, present
 from armcal_servobus.device import ServoBusSettings, ServoStreamSettings
 from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos
 
@@ -44,7 +44,7 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
     Their baud rates, ids, models, and what they report. Nothing is written to them.
     """
     protocols: tuple[ProtocolName, ...] = (protocol,) if protocol else get_args(ProtocolName)
-    rates = [(spoken, rate) for spoken in protocols for rate in baud or BAUD_RATES[spoken]]
+    rates = [(spoken, rate) for spoken in protocols for rate in baud or MAPS[spoken].bauds]
     there: dict[ProtocolName, list[dict[str, Any]]] = {}
     with console.progress() as show:
         for place, (spoken, rate) in enumerate(rates):
