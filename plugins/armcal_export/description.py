@@ -186,7 +186,8 @@ _Dumper.add_representer(str, _quoted)
 def described(request: ExportRequest) -> dict[str, Any]:
     """The arm as ``arm.schema.json`` has it."""
     content, origin, statics = content_of(request), request.origin, request.environment
-    effects: Mapping[str, Mapping[str, Any]] = request.description.get("effects", {})
+    # as JSON has them: lists for tuples
+    effects = json.loads(json.dumps(request.description.get("effects", {}), default=dict))
     return {
         "armcal_arm": _SCHEMA,
         "arm": request.name,
@@ -204,7 +205,7 @@ def described(request: ExportRequest) -> dict[str, Any]:
             {
                 "name": name,
                 "type": str(effects.get(name, {}).get("type", "")),
-                "settings": _plain({key: value for key, value in effects.get(name, {}).items() if key != "type"}),
+                "settings": {key: value for key, value in effects.get(name, {}).items() if key != "type"},
             }
             for name in request.arm.effects
         ],
@@ -260,10 +261,3 @@ def _pose(matrix: Array) -> dict[str, Any]:
 
 def _floats(numbers: Any) -> list[float]:
     return [float(number) for number in numbers]
-
-
-def _plain(value: Any) -> Any:
-    """Settings as JSON has them: lists for tuples."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(own) for key, own in value.items()}
-    return [_plain(own) for own in value] if isinstance(value, list | tuple) else value

@@ -87,10 +87,7 @@ class Chip:
 
     def __init__(self, link: Link, clock: Clock, address: int, prescale: int) -> None:
         self._link, self._clock, self._address, self._prescale = link, clock, address, prescale
-
-    @property
-    def where(self) -> Location:
-        return Location(f"PCA9685 at 0x{self._address:02x}")
+        self.where = Location(f"PCA9685 at 0x{address:02x}")
 
     def prepare(self, foreign_pulses: ForeignPulses) -> None:
         """Make it ready. Pulses that run with the right prescale go on untouched; none begins.

@@ -2,10 +2,10 @@
 
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 import numpy as np
@@ -15,9 +15,7 @@ from armcal.errors import DataError
 from armcal.io.plain_files import refuse, require_new, write_new
 
 from armcal_ros2.reader import (
-    CAMERA_INFO,
     GUARD_S,
-    IMAGES,
     JOINT_STATE,
     MEASURED,
     TRANSFORMS,
@@ -30,6 +28,8 @@ from armcal_ros2.reader import (
     nanoseconds,
 )
 
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _MOST_FRAMES = 200
 _LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once
 
@@ -48,14 +48,8 @@ class TopicSummary:
         return [frame for frame, count in self.frames.items() if 2 * self.computed[frame] < count]
 
 
-class Survey(NamedTuple):
-    topics: dict[str, TopicSummary]
-    joints: dict[str, JointLog]  # by topic
-    remarks: list[str]  # what is missing or wrong
-
-
-def survey(bag: Bag) -> Survey:
-    """Once through the recording."""
+def survey(bag: Bag) -> tuple[dict[str, TopicSummary], dict[str, JointLog], list[str]]:
+    """Once through the recording: topics by name, joint states by topic, what is missing or wrong."""
     topics, joints, remarks = dict[str, TopicSummary](), dict[str, JointLog](), list[str]()
     stamps = deque[int](maxlen=_LATEST)
     for topic, received, _, message in bag.messages(lambda topic: topic.type in (JOINT_STATE, *MEASURED)):
@@ -91,20 +85,20 @@ def survey(bag: Bag) -> Survey:
     for name, summary in topics.items():
         if summary.computed.total() and not summary.measured:
             remarks.append(f"all frames in {name} are computed from the joints: they measure nothing.")
-    return Survey(topics, joints, [*bag.remarks, *remarks])
+    return topics, joints, [*bag.remarks, *remarks]
 
 
-def _data_section(path: Path, content: Survey) -> dict[str, Any]:
+def _data_section(path: Path, topics: Mapping[str, TopicSummary], joints: Mapping[str, JointLog]) -> dict[str, Any]:
     """One that would read it; empty without joint states."""
-    if not content.joints:
+    if not joints:
         return {}
-    topic, log = max(content.joints.items(), key=lambda entry: len(entry[1].rests))
+    topic, log = max(joints.items(), key=lambda entry: len(entry[1].rests))
     section: dict[str, Any] = {"type": "rosbag2", "path": str(path), "joints": {"topic": topic}}
     numbered = {f"q{i}": name for i, name in enumerate(log.names, start=1)}
     if set(numbered) != set(log.names):
         section["joints"]["names"] = numbered
     measured: dict[str, dict[str, str]] = {}
-    for name, summary in content.topics.items():
+    for name, summary in topics.items():
         if summary.type not in MEASURED or name.endswith("_static") or not summary.measured:
             continue
         instance = f"tracker{len(measured) + 1}" if measured else "tracker"
@@ -125,9 +119,8 @@ def bag() -> None:
 @speaking
 def info(console: Console, path: Path) -> None:
     """Topics, times and rests of the recording PATH, and a data section for a configuration."""
-    content = survey(Bag(path))
-    topics, joints, remarks = content
-    data = _data_section(path, content)
+    topics, joints, remarks = survey(Bag(path))
+    data = _data_section(path, topics, joints)
     console.result(
         {
             "topics": {name: vars(topic) for name, topic in topics.items()},
@@ -152,7 +145,7 @@ def info(console: Console, path: Path) -> None:
     if data.get("measurements"):
         _show_data(console, data, "names" in data["joints"])
     for name, topic in topics.items() if data else ():
-        if topic.type in IMAGES:
+        if topic.type in _IMAGES:
             console.line(f"Images of its rests: armcal bag images {path} --topic {name} --out FOLDER")
 
 
@@ -168,9 +161,9 @@ def images(
 ) -> None:
     """Take one image of each rest out of the recording PATH, for the reader images."""
     recording = Bag(path)
-    content = survey(recording)
-    seen = _only(path, [name for name, own in content.topics.items() if own.type in IMAGES], topic, "images", "--topic")
-    log = content.joints[_only(path, list(content.joints), joints, "joint states", "--joints")]
+    topics, logs, remarks = survey(recording)
+    seen = _only(path, [name for name, own in topics.items() if own.type in _IMAGES], topic, "images", "--topic")
+    log = logs[_only(path, list(logs), joints, "joint states", "--joints")]
     rests = [rest for rest in log.rests if rest.end - rest.begin >= RestSettings().window]
     table, information = out / "joints.csv", out / "camera_info.yaml"
     require_new([table, information])
@@ -180,7 +173,7 @@ def images(
         suffix, picture = picture_of(message, seen)
         written[place] = f"rest{place + 1:04d}{suffix}"
         write_new({out / written[place]: picture})
-    remarks = [*content.remarks, *stamps.check(str(path))]
+    remarks += stamps.check(str(path))
     if not written:
         refuse(path, f"found no image of {seen} in {len(rests)} rests.", " ".join(remarks) or "Record again.")
     if len(written) < len(rests):
@@ -235,7 +228,7 @@ def _nearest(
     above = topic.removesuffix("/compressed").rpartition("/")[0]
     held: tuple[int, float, Any] | None = None
     for own, received, _, message in bag.messages(lambda read: read.name in (topic, f"{above}/camera_info")):
-        if own.type == CAMERA_INFO:
+        if own.type == _CAMERA_INFO:
             infos.append(message)
             continue
         time = stamps.time(nanoseconds(message.header.stamp), received)

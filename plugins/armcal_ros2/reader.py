@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, NoReturn
 
 import numpy as np
@@ -28,14 +27,12 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _PURPOSE = "reading recordings of ROS 2"
 _MOST_DELAYS = 4096
 _ZERO, _SAME = "with the stamp zero", "with the stamp of the one before"
 _EARLIER = "with a stamp before that of an earlier one"
 # A larger part of the messages, and times are not to be trusted
-_MOST: Mapping[str, float] = MappingProxyType({_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01})
+_MOST = {_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01}
 Clock = Literal["header", "receive"]
 
 
@@ -297,13 +294,11 @@ class JointLog:
 
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-_FIELDS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {
-        "geometry_msgs/msg/PoseStamped": ("pose", "position", "orientation"),
-        "geometry_msgs/msg/PointStamped": ("", "point", ""),
-        "geometry_msgs/msg/TransformStamped": ("transform", "translation", "rotation"),
-    }
-)
+_FIELDS = {
+    "geometry_msgs/msg/PoseStamped": ("pose", "position", "orientation"),
+    "geometry_msgs/msg/PointStamped": ("", "point", ""),
+    "geometry_msgs/msg/TransformStamped": ("transform", "translation", "rotation"),
+}
 MEASURED = (*_FIELDS, TRANSFORMS)  # The types of messages that measure
 _NORM_TOLERANCE = 1e-3
 _STATIC = "/tf_static"
@@ -375,9 +370,20 @@ class MeasuredLog:
         p, q = getattr(content, position), getattr(content, orientation) if orientation else None
         self._take(time, np.array([p.x, p.y, p.z]), None if q is None else np.array([q.x, q.y, q.z, q.w]))
 
-    def close(self, place: str) -> list[str]:
-        """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for."""
+    def close(self, place: str, types: Mapping[str, str]) -> list[str]:
+        """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for.
+
+        ``types`` are those of the messages in the recording, by topic.
+        """
         s, count = self.settings, self.stamps.count
+        if types.get(s.topic) not in self.types:
+            have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
+            kind = f"the type {types[s.topic]}" if s.topic in types else "no such topic"
+            expected = ", ".join(name.rpartition("/")[2] for name in self.types)
+            hint = f"Topics that measure are {have}."
+            if types.get(s.topic) == TRANSFORMS:
+                hint = "Give reference and frame: the pose of frame in reference is read."
+            refuse(place, f"found {kind} for {self.instance} ({s.topic}), expected {expected}.", hint)
         where = f"{place}, data.measurements.{self.instance}"
         if s.reference is not None and not count:
             frames = ", ".join(sorted({*self._edges, *(edge[0] for edge in self._edges.values())}))
@@ -553,8 +559,7 @@ class Rosbag2Reader:
             self._refuse(f"found no rest of at least {s.still.window:g} s in {joints.stamps.topic}.", hint)
         types = {topic.name: topic.type for topic in bag.topics}
         for measured in logs:
-            self._require(measured, types)
-            remarks += measured.close(str(s.path))
+            remarks += measured.close(str(s.path), types)
         dataset = self._dataset(request, list(channels), joints, logs, [*bag.remarks, *remarks])
         return read_as(replace(dataset, sha256=digest.hexdigest()), request, by_line=False)
 
@@ -577,18 +582,6 @@ class Rosbag2Reader:
             self._refuse(f"found {twice[0]} for {both}, expected one joint of the recording each.", "Correct names.")
         return channels
 
-    def _require(self, log: MeasuredLog, types: Mapping[str, str]) -> None:
-        topic = log.settings.topic
-        if types.get(topic) in log.types:
-            return
-        have = ", ".join(name for name, own in sorted(types.items()) if own in MEASURED) or "none"
-        kind = f"the type {types[topic]}" if topic in types else "no such topic"
-        expected = ", ".join(name.rpartition("/")[2] for name in log.types)
-        hint = f"Topics that measure are {have}."
-        if types.get(topic) == TRANSFORMS:
-            hint = "Give reference and frame: the pose of frame in reference is read."
-        self._refuse(f"found {kind} for {log.instance} ({topic}), expected {expected}.", hint)
-
     def _dataset(
         self, request: ReadRequest, names: list[str], joints: JointLog, logs: Sequence[MeasuredLog], remarks: list[str]
     ) -> Dataset:
@@ -609,9 +602,9 @@ class Rosbag2Reader:
             if is_inverted(nominal_tools(request.arms[arm], angles), np.array([one.pose for one in own])):
                 text = f"the poses of {name} are those of its instrument in the body: their inverses move as the arm"
                 mend = f"Set inverted: {str(not log.settings.inverted).lower()} for {name}."
-                self._refuse(
-                    f"{text} does.", mend if log.settings.reference is None else "Exchange frame and reference."
-                )
+                if log.settings.reference is not None:
+                    mend = "Exchange frame and reference."
+                self._refuse(f"{text} does.", mend)
             remarks += self._clock_remarks(log, joints, own)
             extra[f"{name}_samples"] = tuple(str(one.samples) for one in own)
             extra[f"{name}_scatter_mm"] = tuple(f"{1000 * one.deviation:.4f}" for one in own)

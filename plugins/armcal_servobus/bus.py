@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Literal, NamedTuple
 
 from armcal.arm.servo import teeth_text
@@ -69,6 +68,7 @@ class RegisterMap:
     position_mode: int  # what the register of the operating mode holds while they go to positions
     offset_limit: int  # the largest magnitude of the homing offset
     offset_sign: int  # of the offset in the position that they report: -1 if that is the encoder's less the offset
+    bauds: tuple[int, ...]  # rates that they can be set to, the likeliest first
 
     def numbers(self, stretch: Stretch, data: bytes) -> dict[str, int]:
         """What a stretch of registers holds, by name."""
@@ -89,13 +89,9 @@ class ServoModel(NamedTuple):
     teeth: int = 0  # of the spline on which its horn sits; 0: not known
     knows_load: bool = True  # whether its register of load has a share of its full torque, and not a current
 
-    @property
-    def map(self) -> RegisterMap:
-        return MAPS[self.protocol]
-
     def check_offset(self, offset: int) -> None:
         """Raise ValueError if a servo cannot hold a homing offset; it says what to do."""
-        limit = self.map.offset_limit
+        limit = MAPS[self.protocol].offset_limit
         if (beyond := abs(offset) - limit) <= 0:
             return
         amount = f"its horn by {math.degrees(beyond * STEP):.0f} deg or more"
@@ -121,28 +117,28 @@ def _registers(protocol: ProtocolName) -> dict[str, Register]:
 
 
 _ALARMS = {0x01: "voltage", 0x02: "angle sensor", 0x04: "overheating", 0x20: "overload"}
-MAPS: Mapping[ProtocolName, RegisterMap] = MappingProxyType(
-    {
-        "feetech": RegisterMap(
-            _registers("feetech"),
-            polled=((40, 27),),
-            stored=(9, 25),
-            alarms=_ALARMS | {0x08: "overcurrent"},
-            position_mode=0,
-            offset_limit=2047,
-            offset_sign=-1,
-        ),
-        "dynamixel2": RegisterMap(
-            _registers("dynamixel2"),
-            polled=((64, 7), (116, 31)),
-            stored=(11, 45),
-            alarms=_ALARMS | {0x08: "encoder", 0x10: "shock"},
-            position_mode=3,
-            offset_limit=1024,
-            offset_sign=1,
-        ),
-    }
-)
+MAPS: Mapping[ProtocolName, RegisterMap] = {
+    "feetech": RegisterMap(
+        _registers("feetech"),
+        polled=((40, 27),),
+        stored=(9, 25),
+        alarms=_ALARMS | {0x08: "overcurrent"},
+        position_mode=0,
+        offset_limit=2047,
+        offset_sign=-1,
+        bauds=(1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400),
+    ),
+    "dynamixel2": RegisterMap(
+        _registers("dynamixel2"),
+        polled=((64, 7), (116, 31)),
+        stored=(11, 45),
+        alarms=_ALARMS | {0x08: "encoder", 0x10: "shock"},
+        position_mode=3,
+        offset_limit=1024,
+        offset_sign=1,
+        bauds=(57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600),
+    ),
+}
 _BY_LOAD = {"xl430-w250": 1060, "xc430-w150": 1070, "xc430-w240": 1080, "mx28-2": 30}
 _BY_CURRENT = {
     **{"xl330-m077": 1190, "xl330-m288": 1200, "xc330-t181": 1210, "xc330-t288": 1220, "xc330-m181": 1230},
@@ -157,15 +153,7 @@ _ALL = (
     *(ServoModel(name, "dynamixel2", number) for name, number in _BY_LOAD.items()),
     *(ServoModel(name, "dynamixel2", number, knows_load=False) for name, number in _BY_CURRENT.items()),
 )
-MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for model in _ALL})
-# Those that servos can be set to, the likeliest first
-BAUD_RATES: Mapping[ProtocolName, tuple[int, ...]] = MappingProxyType(
-    {
-        "feetech": (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400),
-        "dynamixel2": (57_600, 1_000_000, 115_200, 2_000_000, 3_000_000, 4_000_000, 9_600),
-    }
-)
-
+MODELS: Mapping[str, ServoModel] = {model.name: model for model in _ALL}
 
 LAST_ID = 0xFC  # Both protocols know it; Feetech's has 253 too, which armcal keeps free to listen for echoes
 SILENT_MEND = "Look at its plug and its power; armcal bus find shows who answers, and at which baud rate."
@@ -279,23 +267,19 @@ def _crc16(packet: bytes) -> bytes:
 
 
 _DAMAGED = "the instruction arrived damaged"  # After this refusal the same instruction may be sent again
-_REFUSALS2 = MappingProxyType(
-    {
-        1: "it could not do it",
-        2: "it does not know the instruction",
-        3: _DAMAGED,
-        4: "the value is out of its range",
-        5: "the data have another length than the register",
-        6: "the value is beyond a limit that is set in it",
-        7: "the register is read-only, or locked while torque is on",
-    }
-)
-FRAMINGS: Mapping[ProtocolName, Framing] = MappingProxyType(
-    {
-        "feetech": Framing(b"\xff\xff", 1, _inverted_sum),
-        "dynamixel2": Framing(b"\xff\xff\xfd\0", 2, _crc16, b"\x55", b"\xff\xff\xfd", _REFUSALS2),
-    }
-)
+_REFUSALS2 = {
+    1: "it could not do it",
+    2: "it does not know the instruction",
+    3: _DAMAGED,
+    4: "the value is out of its range",
+    5: "the data have another length than the register",
+    6: "the value is beyond a limit that is set in it",
+    7: "the register is read-only, or locked while torque is on",
+}
+FRAMINGS: Mapping[ProtocolName, Framing] = {
+    "feetech": Framing(b"\xff\xff", 1, _inverted_sum),
+    "dynamixel2": Framing(b"\xff\xff\xfd\0", 2, _crc16, b"\x55", b"\xff\xff\xfd", _REFUSALS2),
+}
 
 
 class BusSettings(SerialPortSettings):

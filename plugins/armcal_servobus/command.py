@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
 
@@ -17,11 +17,10 @@ from armcal.devices.device import DeviceError, DeviceRefusedError
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
-from armcal_servobus.bus import BAUD_RATES, COUNTS, LAST_ID, STEP, Bus, BusSettings, ProtocolName, looked_at, present
+from armcal_servobus.bus import COUNTS, LAST_ID, MAPS, STEP, Bus, BusSettings, ProtocolName, looked_at, present
 from armcal_servobus.device import ServoBusSettings, ServoStreamSettings
 from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos
 
-_SECTION = "bench"
 _KINDS: Mapping[str, type[ServoJointsSettings]] = {"device": ServoBusSettings, "joints": ServoStreamSettings}
 Number = TypeVar("Number", int, float)
 _EEPROM_S = 0.02
@@ -45,7 +44,7 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
     Their baud rates, ids, models, and what they report. Nothing is written to them.
     """
     protocols: tuple[ProtocolName, ...] = (protocol,) if protocol else get_args(ProtocolName)
-    rates = [(spoken, rate) for spoken in protocols for rate in baud or BAUD_RATES[spoken]]
+    rates = [(spoken, rate) for spoken in protocols for rate in baud or MAPS[spoken].bauds]
     there: dict[ProtocolName, list[dict[str, Any]]] = {}
     with console.progress() as show:
         for place, (spoken, rate) in enumerate(rates):
@@ -91,15 +90,13 @@ def _on_config(command: Any) -> Any:
 def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Servos, WiringRecord]]:
     """The servos of the bench's device, or of its joint stream, and the record of which were checked."""
     source = load_config(config, overrides)
-    bench = source.data.get(_SECTION)
+    bench = source.data.get("bench")
     parts = bench if isinstance(bench, dict) else {}
     there = (p for p in _KINDS if isinstance(parts.get(p), dict) and parts[p].get("type") == "servobus")
     if (part := next(there, None)) is None:
         hint = "Give bench: {device: {type: servobus, port: ..., joints: ...}}; docs/servo_bus.md has an example."
-        raise ConfigError("found no servo bus.", where=source.where((_SECTION,)), hint=hint)
-    stripped = {key: value for key, value in parts[part].items() if key != "type"}
-    data = {**source.data, _SECTION: {**parts, part: stripped}}
-    settings = validate(_KINDS[part], replace(source, data=data), (_SECTION, part))
+        raise ConfigError("found no servo bus.", where=source.where(("bench",)), hint=hint)
+    settings = validate(_KINDS[part], source, ("bench", part), beside=("type",))
     servos = Servos(settings, settings.joints)
     servos.bus.open()
     try:

@@ -94,8 +94,8 @@ class ServoBusDevice(JointDevice, MeasuringDevice):
     def open(self, clock: Clock) -> DeviceIdentity:
         self.close()
         self._clock, self._loaded_since, self._reported = clock, {}, set()
-        adapter = self._servos.open()
         try:
+            adapter = self._servos.open()
             readings = self._servos.readings()
             self._check(readings)
             for joint, reading in readings.items():  # one that has started anew may hold, and knows no limit

@@ -151,17 +151,15 @@ class Servos:
         self.stored: dict[str, dict[str, int]] = {}  # what those that ``examine`` recognised keep without power
 
     def open(self, *, moves: bool = True) -> str:
-        """Open the bus; gives the adapter's serial number where all is as configured, else names every fault."""
-        try:
-            adapter = self.bus.open()
-            mistakes = [mistake for mistake in self.examine() if moves or not mistake.of_motion]
-            if mistakes:
-                listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in mistakes)
-                text, hints = f"found servos that are not as configured: {listed}.", (m.mend for m in mistakes)
-                raise DeviceRefusedError(text, where=self.bus.where, hint=" ".join(dict.fromkeys(hints)))
-        except BaseException:
-            self.bus.close()
-            raise
+        """Open the bus; gives the adapter's serial number where all is as configured, else names every fault.
+
+        Who calls it closes the bus if that fails.
+        """
+        adapter = self.bus.open()
+        if mistakes := [mistake for mistake in self.examine() if moves or not mistake.of_motion]:
+            listed = "; ".join(f"{mistake.joint} {mistake.what}" for mistake in mistakes)
+            text, hints = f"found servos that are not as configured: {listed}.", (m.mend for m in mistakes)
+            raise DeviceRefusedError(text, where=self.bus.where, hint=" ".join(dict.fromkeys(hints)))
         return adapter
 
     def examine(self) -> list[Mistake]:
@@ -189,7 +187,7 @@ class Servos:
                 mistakes.append(Mistake(joint.label, f"is {other}, expected {model.name}", mend))
             else:
                 self.stored[name] = bus.numbers((joint.id,), bus.map.stored)[joint.id]
-                mistakes += _mistakes(joint, self.stored[name])
+                mistakes += _mistakes(joint, self.stored[name], bus.map.position_mode)
         return mistakes
 
     def readings(self) -> dict[str, dict[str, int]]:
@@ -211,10 +209,10 @@ class Servos:
             raise DeviceError(text, where=self.bus.where, hint="Hold the arm and switch the servos' power off.")
 
 
-def _mistakes(joint: ServoJoint, stored: Mapping[str, int]) -> list[Mistake]:
+def _mistakes(joint: ServoJoint, stored: Mapping[str, int], mode: int) -> list[Mistake]:
     """What a servo holds that does not fit its joint."""
     mistakes = []
-    stated, mode, least, most = joint.settings.offset, joint.model.map.position_mode, stored["min"], stored["max"]
+    stated, least, most = joint.settings.offset, stored["min"], stored["max"]
     if stated is not None and stated != stored["offset"]:
         what = f"holds the homing offset {stored['offset']}, expected {stated}"
         mend = f"Write it with armcal bus home CONFIG --offset {joint.name}={stated}, or correct offset."
