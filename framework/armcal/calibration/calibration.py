@@ -19,7 +19,7 @@ from armcal.calibration.calibration_file import (
     SHARE,
     UNSTATED_M,
     CalibrationFile,
-    check_record,
+    CheckRecord,
     components,
     differences,
     identity_of,
@@ -126,7 +126,22 @@ class Calibration:
         checks = None
         if commands is not None:
             stated = self.plus_minus(commands) if self.record.prediction and self.readable else None
-            checks = check_record(self.system, self.parameters, commands, stated)
+            channels, tools = predict(self.system, self.parameters, commands)
+            widths = {} if stated is None else {n: float(np.min(w)) for n, w in stated.half_widths.items()}
+            radii = [] if stated is None else [float(np.min(radius)) for radius in stated.radii.values()]
+            names = tuple(commands.channels)
+            checks = CheckRecord(
+                channels=names,
+                records=tuple(tuple(row) for row in commands.stacked(names).T.tolist()),
+                values=tuple(self.parameters.nominal().tolist()),
+                predicted={name: tuple(row.tolist()) for name, row in channels.items() if np.isfinite(row).all()},
+                tools={
+                    name: tuple(tuple(pose[:3].ravel().tolist()) for pose in poses)
+                    for name, poses in zip(self.system.arms, tools, strict=True)
+                },
+                half_widths={name: width for name, width in widths.items() if np.isfinite(width) and width > 0},
+                radius=min((radius for radius in radii if np.isfinite(radius) and radius > 0), default=None),
+            )
         physics = {"checks": checks, "components": components(self.system, registry)}
         return replace(self, record=self.record.model_copy(update=physics))
 

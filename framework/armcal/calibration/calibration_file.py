@@ -26,7 +26,7 @@ from armcal.base.config_text import finite, plain
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import Parameters
 from armcal.base.settings import Settings
-from armcal.calibration.intervals import PlusMinus, PredictionRecord
+from armcal.calibration.intervals import PredictionRecord
 from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
 from armcal.config.yaml_source import ConfigSource, load_config, needs_quotes
@@ -52,11 +52,7 @@ _LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 
 
 class ParameterRecord(Settings):
-    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known.
-
-    ``determined_by`` is null where it is fixed. ``unconstrained`` is where the records would have it if no bound held
-    any parameter, where that differs: who goes on from the calibration needs it, for a bound is no evidence.
-    """
+    """One canonical entry as it is kept; ``sd``, ``lower`` and ``upper`` are null where they are not known."""
 
     name: str
     unit: str
@@ -66,9 +62,9 @@ class ParameterRecord(Settings):
     sd: float | None = None
     lower: float | None = None
     upper: float | None = None
-    determined_by: DeterminedBy | None = None
+    determined_by: DeterminedBy | None = None  # null where it is fixed
     at_bound: bool = False
-    unconstrained: float | None = None
+    unconstrained: float | None = None  # where records without bounds would have it; a bound is no evidence
 
 
 class InformationRecord(Settings):
@@ -90,19 +86,15 @@ class ComponentRecord(Settings):
 
 
 class CheckRecord(Settings):
-    """Predictions at some recorded commands (SI, a row a record) with all parameters at ``values``.
-
-    Channels of instruments by name, with the least half width of their 90 % intervals; base_T_tool by arm, its upper
-    three rows one after another, with the least 95 % radius of a position.
-    """
+    """Predictions at some recorded commands (SI, a row a record) with all parameters at ``values``."""
 
     channels: tuple[str, ...]
     records: tuple[tuple[float, ...], ...]
     values: tuple[float, ...]
-    predicted: dict[str, tuple[float, ...]]
-    tools: dict[str, tuple[tuple[float, ...], ...]]
-    half_widths: dict[str, float]
-    radius: float | None = None
+    predicted: dict[str, tuple[float, ...]]  # readings of instruments by channel
+    tools: dict[str, tuple[tuple[float, ...], ...]]  # base_T_tool by arm, its upper three rows one after another
+    half_widths: dict[str, float]  # the least of the 90 % intervals, by channel
+    radius: float | None = None  # the least of a position, 95 % (m)
 
     @property
     def commands(self) -> Dataset:
@@ -154,7 +146,6 @@ def identity_of(description: Mapping[str, Any]) -> str:
 
 
 def parameter_records(estimate: Estimate) -> tuple[ParameterRecord, ...]:
-    """Every canonical entry of an estimate."""
     parameters, nominal = estimate.parameters, estimate.parameters.nominal()
     units = [unit for block in parameters.blocks for unit in block.entry_units]
     place = {name: i for i, name in enumerate(estimate.names)}
@@ -266,7 +257,6 @@ CHECK_POSES = 8
 
 
 def readable(system: System) -> Mapping[str, Measurement]:
-    """The measurements whose readings a single pose has: a contact reads nothing."""
     measurements = system.measurements.items()
     return {name: m for name, m in measurements if m.channels() and not isinstance(m, PairedMeasurement)}
 
@@ -284,7 +274,6 @@ def predict(system: System, parameters: Parameters, commands: Dataset) -> tuple[
 
 
 def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecord, ...]:
-    """What a system is made of, armcal's own mechanics first."""
     plugins = {(plugin.name, plugin.module): plugin for plugin in registry.plugins}
     core = ComponentRecord(
         kind="core",
@@ -314,7 +303,6 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
 
 
 def require_present(kept: tuple[ComponentRecord, ...], registry: PluginRegistry, where: Location) -> None:
-    """Raise PluginError for the first component that no plugin offers."""
     offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
     for record in kept:
         if (record.kind, record.name) not in offered:
@@ -361,26 +349,6 @@ def check_poses(system: System, dataset: Dataset, candidates: Indices) -> Datase
     chosen = {name: dataset.column(name)[rows] for name in dataset.channels if name in names}
     finite = {name: column for name, column in chosen.items() if np.isfinite(column).all()}
     return Dataset(tuple(str(row + 1) for row in rows), finite)
-
-
-def check_record(system: System, parameters: Parameters, commands: Dataset, stated: PlusMinus | None) -> CheckRecord:
-    """Predictions with the parameters at their nominal values, and what is stated about their accuracy."""
-    channels, tools = predict(system, parameters, commands)
-    widths = {} if stated is None else {n: float(np.min(w)) for n, w in stated.half_widths.items()}
-    radii = [] if stated is None else [float(np.min(radius)) for radius in stated.radii.values()]
-    names = tuple(commands.channels)
-    return CheckRecord(
-        channels=names,
-        records=tuple(tuple(row) for row in commands.stacked(names).T.tolist()),
-        values=tuple(parameters.nominal().tolist()),
-        predicted={name: tuple(row.tolist()) for name, row in channels.items() if np.isfinite(row).all()},
-        tools={
-            name: tuple(tuple(pose[:3].ravel().tolist()) for pose in poses)
-            for name, poses in zip(system.arms, tools, strict=True)
-        },
-        half_widths={name: width for name, width in widths.items() if np.isfinite(width) and width > 0},
-        radius=min((radius for radius in radii if np.isfinite(radius) and radius > 0), default=None),
-    )
 
 
 def under_load(kept: CheckRecord, environment: Environment) -> CheckRecord:

@@ -255,7 +255,6 @@ class ServoCounts:
         self._offsets = np.arange(-wide, wide + 1)
 
     def counts(self, commands: Array) -> Counts:
-        """The whole counts nearest to commands (n x N; rad)."""
         whole = np.zeros(commands.shape, dtype=np.int64)
         for i, servo in enumerate(self._servos):
             if servo is not None:
@@ -566,7 +565,6 @@ class Compensator:
         return np.broadcast_to(numbers, (count, len(self.joints))).T.copy()
 
     def _set(self, commands: Array) -> Array:
-        """What the board makes of commands (n x N)."""
         if self._counts is None:
             return commands
         return self._counts.angles(self._counts.counts(commands), commands)
@@ -576,7 +574,6 @@ class Compensator:
         return finder.first(record, _goal(targets)) if start is None else finder.onward(record, _goal(targets), start)
 
     def _commands(self, record: Array, targets: Targets, solutions: Solutions) -> Commands:
-        """What is commanded: exact, or the best counts; and where that leads."""
         joints, counts = len(self.joints), None
         record[:joints] = solutions.commands
         rounding = self._kind("position" if targets.rotations is None else "pose")[1]
@@ -611,7 +608,6 @@ class Compensator:
     def _reasons(
         self, record: Array, targets: Targets, solutions: Solutions, had: Mask, bounds: Array
     ) -> tuple[str, ...]:
-        """A sentence for each target that is not reached; empty for the others."""
         barred = "are too near to something" + ", or turn a coupled joint too far" * bool(self.expression.arm.couplings)
         lost, turned = np.flatnonzero(~had), np.zeros(len(had), dtype=bool)
         near = lost[(bounds[lost] == 0) & ~solutions.forbidden[lost]]
@@ -666,7 +662,6 @@ class Compensator:
 
     @cached_property
     def _tells_approach(self) -> bool:
-        """Whether it matters from where a joint comes."""
         names = [f"{APPROACH}{joint}" for joint in self.joints]
         return self.expression.uses(names)
 

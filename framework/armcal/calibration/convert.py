@@ -60,7 +60,6 @@ class Difference:
 
 
 def load_source(path: str | Path, arm: str | None, registry: PluginRegistry) -> ConvertSource:
-    """The chain of an arm of a configuration or a calibration."""
     source = load_config(path)
     arms = source.data.get("arms")
     if not isinstance(arms, dict) or not arms:
@@ -123,7 +122,6 @@ UNKNOWN = "0"  # What a URDF has to state and nobody knows: effort, velocity, an
 
 
 def poe_section(chain: RigidChain) -> dict[str, Any]:
-    """Every axis by its direction and a point, and the tool at zero angles."""
     require_independent(chain, "poe")
     require_plain_axes(chain, "poe")
     joints = [
@@ -229,7 +227,6 @@ class Link:
 
 
 def mdh_section(chain: RigidChain, convention: Convention) -> dict[str, Any]:
-    """Rows, and steps before and after them."""
     require_independent(chain, "mdh")
     require_plain_axes(chain, "mdh")
     direction, frame = chain.joints[0].direction, np.array(chain.joints[0].base_T_joint)
@@ -300,7 +297,6 @@ def _steps(pose: Array) -> list[dict[str, float]]:
 
 
 def _motion(axis: str, angle: float, distance: float) -> Array:
-    """A turn about and a shift along a coordinate axis (4x4)."""
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
     motion = np.eye(4)

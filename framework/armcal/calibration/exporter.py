@@ -108,7 +108,6 @@ class Exporter(Protocol):
 
 
 def changed_numbers(request: ExportRequest) -> int:
-    """How many of the arm's calibrated numbers are not the nominal ones."""
     nominal = {block.name: block.nominal for block in request.arm.parameters()}
     return sum(float(a) != b for n, value in request.values.items() for a, b in zip(value, nominal[n], strict=True))
 
@@ -168,7 +167,6 @@ def rigid_tools(arm: Arm, values: Mapping[str, Array], commands: Array) -> Array
 
 
 def leaves_residual_out(exporter: Exporter, request: ExportRequest) -> bool:
-    """Whether the arm has learned a pose residual that a format does not hold."""
     residual = request.arm.residual
     return residual is not None and residual.is_learned and not getattr(exporter, "holds_residual", False)
 

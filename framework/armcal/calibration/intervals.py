@@ -78,8 +78,6 @@ def covariance_rows(covariance: Array) -> tuple[tuple[float, ...], ...]:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What a calibration knows of its own errors."""
-
     system: System  # arms and measurements
     parameters: Parameters  # as fitted: free ones free, about the nominal values of the fit
     values: Array  # found
@@ -193,7 +191,6 @@ Ranges = Mapping[str, tuple[float, float]]
 
 
 def recorded_ranges(dataset: Dataset, arms: Mapping[str, Arm], payload: float | None) -> dict[str, tuple[float, float]]:
-    """Of the records; ``payload`` (kg) is the configured one, which counts where they state none."""
     ranges = {} if payload is None else {PAYLOAD: (payload, payload)}
     for channel in filter(dataset.has, (*command_channels(arms), PAYLOAD)):
         values = dataset.column(channel)
@@ -214,7 +211,6 @@ class RecordedRange:
 
     @classmethod
     def of(cls, ranges: Ranges, channels: Sequence[str], arms: Mapping[str, Arm]) -> Self:
-        """Of some channels: joints of these arms, the payload, and ``UNKNOWN``."""
         dimensions = {**command_channels(arms), UNKNOWN: "length"}
         names = tuple(channel.rpartition(".")[2] if len(arms) == 1 else channel for channel in channels)
         units = tuple(display_unit(dimensions.get(channel, "mass")).name for channel in channels)
@@ -229,7 +225,6 @@ class RecordedRange:
         return (values < self.limits[:, :1]) | (values > self.limits[:, 1:])
 
     def sentence(self, values: Array) -> str:
-        """About the poses (C x N) that lie beyond; empty if none does."""
         beyond = self.beyond(values)
         texts = []
         for i in np.flatnonzero(beyond.any(axis=1)):

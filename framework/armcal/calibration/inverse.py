@@ -544,7 +544,6 @@ class Finder:
         return np.asarray(np.take_along_axis(near, order, axis=1)[:, used:])
 
     def _round(self, record: Array, target: Array, todo: Indices, picks: Indices, solutions: Solutions) -> None:
-        """Searches from seeds of each target (N x wide): what is reached, else what is nearest so far, in place."""
         wide = picks.shape[1]
         attempt, good = self._searched(record, target, todo, *self._seeds.at(picks))
         left = attempt.distances + self.solver.length * attempt.turns
@@ -560,7 +559,6 @@ class Finder:
     def _searched(
         self, record: Array, target: Array, todo: Indices, commands: Array, states: Array, manner: Manner = QUICK
     ) -> tuple[Solutions, Mask]:
-        """Searches for some targets (N) from several starts each (n x N x wide); and which of them arrive."""
         rows = np.repeat(todo, commands.shape[2])
         starts = with_commands(chosen_of(record, rows), commands.reshape(len(commands), len(rows)))
         attempt = self.solver(Goal(starts, states.reshape(len(states), len(rows)), chosen_of(target, rows)), manner)

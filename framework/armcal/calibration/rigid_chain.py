@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armcal.arm.assembly import Arm
-from armcal.arm.model import ArmModel, Chain, Joint, Mimic, forward
+from armcal.arm.model import ArmModel, Chain, Mimic, forward
 from armcal.base.arrays import Array
 from armcal.base.se3 import Transform, evaluated
 from armcal.errors import ProblemError
@@ -21,8 +21,6 @@ _WIDEST = 4 * math.pi
 
 @dataclass(frozen=True)
 class RigidJoint:
-    """One joint at zero angles."""
-
     name: str  # the joint's name
     base_T_joint: Array  # its frame (4x4)
     axis: Array  # about or along which it moves (unit, in its frame)
@@ -62,7 +60,20 @@ def rigid_chain(chain: Chain) -> RigidChain:
     joints = []
     for joint in chain.joints:
         here = here @ _pose(joint.parent_T_joint) @ _pose(joint.motion(joint.offset))
-        joints.append(_rigid(joint, here))
+        facts = (joint.limits, joint.endless, joint.mimic)
+        if joint.twist is None:
+            axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+            joints.append(RigidJoint(joint.name, here, axis, not joint.is_revolute, 0.0, 1.0, *facts))
+            continue
+        angular, linear = (evaluated(part).ravel() for part in joint.twist)
+        if joint.is_revolute:  # the frame is shifted onto an axis that lies beside it
+            scale, beside = float(np.linalg.norm(angular)), np.eye(4)
+            beside[:3, 3] = np.cross(angular, linear) / scale**2
+            pitch, axis, placed = float(angular @ linear) / scale**2, angular / scale, here @ beside
+        else:
+            scale = float(np.linalg.norm(linear))
+            pitch, axis, placed = float(np.linalg.norm(angular)) / scale, linear / scale, here
+        joints.append(RigidJoint(joint.name, placed, axis, not joint.is_revolute, pitch, scale, *facts))
     if chain.tool.joint != len(chain.joints):
         raise ProblemError(
             f"the tool hangs on joint {chain.tool.joint} of {len(chain.joints)}.",
@@ -72,7 +83,6 @@ def rigid_chain(chain: Chain) -> RigidChain:
 
 
 def require_plain_axes(chain: RigidChain, target: str) -> None:
-    """Raise ProblemError for the first joint with a pitch, or with a scale other than one."""
     for number, joint in enumerate(chain.joints, start=1):
         bent, stretched = abs(joint.pitch) > NEGLIGIBLE, abs(joint.scale - 1) > NEGLIGIBLE
         if not (bent or stretched):
@@ -135,25 +145,6 @@ def turn_between(here: Array, there: Array) -> Array:
     if known.any():
         vectors[known] = Rotation.from_matrix(turned[known]).as_rotvec()
     return vectors
-
-
-def _rigid(joint: Joint, placed: Array) -> RigidJoint:
-    """A joint whose frame, offset included, stands here; the frame is shifted onto an axis that lies beside it."""
-    facts = (joint.limits, joint.endless, joint.mimic)
-    if joint.twist is None:
-        axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
-        return RigidJoint(joint.name, placed, axis, not joint.is_revolute, 0.0, 1.0, *facts)
-    angular, linear = (evaluated(part).ravel() for part in joint.twist)
-    if not joint.is_revolute:
-        scale = float(np.linalg.norm(linear))
-        return RigidJoint(
-            joint.name, placed, linear / scale, True, float(np.linalg.norm(angular)) / scale, scale, *facts
-        )
-    scale = float(np.linalg.norm(angular))
-    beside = np.eye(4)
-    beside[:3, 3] = np.cross(angular, linear) / scale**2
-    pitch = float(angular @ linear) / scale**2
-    return RigidJoint(joint.name, placed @ beside, angular / scale, False, pitch, scale, *facts)
 
 
 def _pose(transform: Transform) -> Array:

@@ -225,13 +225,11 @@ class Equilibrium:
         self._evaluator = expression.made(("tool", choice), lambda: Evaluator(expression, tool, many))
 
     def __call__(self, record: Array, state: Array | None = None) -> Standing:
-        """Arms for records (channels x N), from states near or from none."""
         states = np.zeros((self._size, record.shape[1])) if state is None else state.copy()
         tools, settled = self._evaluator.settle(np.zeros(0), record, states)
         return Standing(states, poses_of(tools.reshape(1, 4, 3, -1))[0], settled)
 
     def required(self, record: Array) -> Array:
-        """base_T_tool (N x 4 x 4) for records that must settle."""
         tools = self._evaluator(np.zeros(0), record, np.zeros((self._size, record.shape[1])))
         return np.asarray(poses_of(tools.reshape(1, 4, 3, -1))[0])
 

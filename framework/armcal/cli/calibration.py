@@ -10,7 +10,6 @@ import click
 import numpy as np
 import yaml
 
-from armcal.base.arrays import Array
 from armcal.base.config_text import ConfigText
 from armcal.base.dataset import Dataset
 from armcal.base.quaternions import quaternion_of
@@ -19,7 +18,6 @@ from armcal.base.units import DIMENSIONLESS, parse_quantity, readable, to_unit
 from armcal.calibration.calibration import Calibration
 from armcal.calibration.calibration import accept as accepted
 from armcal.calibration.calibration_file import sealed
-from armcal.calibration.compensation import Compensator
 from armcal.calibration.convert import (
     Convention,
     ConvertSource,
@@ -94,7 +92,17 @@ def predict(console: Console, calibration: Path, poses: Path, out: Path, accept:
             names = (own, name) if len(system.arms) == 1 else (own,)
             requested.append(RequestedChannel(own, names, dimension, required=False))
     shown = [channel for channel in requested if channel.channel in channels]
-    extra, medians = _half_widths(plus_minus, shown) if plus_minus else ({}, {})
+    # Half widths of 90 % intervals with their medians over the poses, 95 % radii in mm, 90 % turns.
+    extra, medians, known = dict[str, tuple[str, ...]](), dict[str, float](), plus_minus or PlusMinus({}, {}, {})
+    for channel, (column, unit) in column_names(shown).items():
+        if channel in known.half_widths:
+            widths = to_unit(known.half_widths[channel], unit)
+            extra[f"plus_minus_{column}"] = short_texts(widths)
+            if np.isfinite(widths).any():
+                medians[column] = float(np.nanmedian(widths))
+    for column, unit, spans in (("radius95", "mm", known.radii), ("turn90", "deg", known.turns)):
+        for name, values in spans.items():
+            extra[f"{'' if len(spans) == 1 else f'{name}.'}{column}_{unit}"] = short_texts(to_unit(values, unit))
     kept = loaded.record.prediction
     if kept is not None and kept.ranges:
         beyond, text = beyond_records(kept.ranges, commands, system.arms, plus_minus.unknown if plus_minus else None)
@@ -145,7 +153,6 @@ def read_commands(registry: PluginRegistry, loaded: Calibration, poses: Path) ->
 
 
 def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset) -> None:
-    """What the calibration knew and these poses do not say."""
     order = ("time", "sequence")
     missing = [name for name in loaded.record.environment_columns if not commands.has(name) and name not in order]
     declared = [(f"{arm.name}.{effect}", c.name) for arm in loaded.system.arms.values() for effect, c in arm.declared]
@@ -161,23 +168,6 @@ def _warn_of_missing(console: Console, loaded: Calibration, commands: Dataset) -
     if kept is not None and kept.drifts and any(map(commands.has, order)):
         text = "these poses are taken for another recording than the calibration's, of whose drift nothing is known."
         console.warn(text)
-
-
-def _half_widths(
-    plus_minus: PlusMinus, shown: Sequence[RequestedChannel]
-) -> tuple[dict[str, tuple[str, ...]], dict[str, float]]:
-    """Columns of half widths of 90 % intervals and of 95 % radii in mm; and medians of the former over the poses."""
-    columns, medians = {}, {}
-    for channel, (column, unit) in column_names(shown).items():
-        if channel in plus_minus.half_widths:
-            widths = to_unit(plus_minus.half_widths[channel], unit)
-            columns[f"plus_minus_{column}"] = short_texts(widths)
-            if np.isfinite(widths).any():
-                medians[column] = float(np.nanmedian(widths))
-    for column, unit, own in (("radius95", "mm", plus_minus.radii), ("turn90", "deg", plus_minus.turns)):
-        for name, values in own.items():
-            columns[f"{'' if len(own) == 1 else f'{name}.'}{column}_{unit}"] = short_texts(to_unit(values, unit))
-    return columns, medians
 
 
 _SHOWN = 5
@@ -228,7 +218,19 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
             f"{1000 * target.distance:.3g} mm away from them. "
             "To bring that one there, give --point target; otherwise --point tool."
         )
-    start = _start(options["start"], compensator)
+    kinds = compensator.expression.arm.commanded
+    begun = dict.fromkeys(compensator.joints, 0.0)  # joints that are not named stand at zero
+    for text in options["start"]:
+        joint, equals, quantity = (part.strip() for part in text.partition("="))
+        at, hint = Location("--start"), "For example --start 'q1=10 deg'."
+        if not equals or joint not in begun:
+            known = ", ".join(compensator.joints)
+            raise InputError(f"found {text!r}, expected JOINT=ANGLE with a joint of {known}.", where=at, hint=hint)
+        try:
+            begun[joint] = parse_quantity(quantity, kinds[joint])
+        except ValueError as fault:
+            raise InputError(f"{joint}: {fault}", where=at, hint=hint) from fault
+    start = np.array([*begun.values()]) if options["start"] else None
     reach = compensator.follow if options["kind"] == "path" else compensator.solve
     answer = Answer(bench, compensator, goals, reach(goals, start))
     write_commands(out, answer, given, angles, options["controller"] is not None)
@@ -237,27 +239,6 @@ def compensate(console: Console, calibration: Path, targets: Path, out: Path, an
         if text := beyond_records(kept.ranges, reached, {bench.arm: compensator.expression.arm})[1]:
             console.warn(text)
     _show_commands(console, given, answer, out)
-
-
-def _start(stated: Sequence[str], compensator: Compensator) -> Array | None:
-    """Commands (n; rad or m); joints that are not named stand at zero."""
-    if not stated:
-        return None
-    kinds = compensator.expression.arm.commanded
-    at = dict.fromkeys(compensator.joints, 0.0)
-    for text in stated:
-        joint, equals, quantity = (part.strip() for part in text.partition("="))
-        hint = "For example --start 'q1=10 deg'."
-        if not equals or joint not in at:
-            known = ", ".join(compensator.joints)
-            raise InputError(
-                f"found {text!r}, expected JOINT=ANGLE with a joint of {known}.", where=Location("--start"), hint=hint
-            )
-        try:
-            at[joint] = parse_quantity(quantity, kinds[joint])
-        except ValueError as fault:
-            raise InputError(f"{joint}: {fault}", where=Location("--start"), hint=hint) from fault
-    return np.array(list(at.values()))
 
 
 def _show_commands(console: Console, given: Dataset, answer: Answer, out: Path) -> None:
@@ -452,7 +433,17 @@ def convert(
         section = _yaml({"type": "urdf", "text": text})
     else:
         text = section = _yaml(poe_section(chain) if target == "poe" else mdh_section(chain, convention))
-    off = _verified(original, section, target, registry)
+    try:
+        off = difference(original.chain, reload(section, registry))
+    except PluginError as fault:
+        hint = f"Install the plugin that offers the model {target}."
+        raise PluginError(f"what would be written cannot be checked: {fault.message}", hint=hint) from fault
+    if not max(off.position_m, off.angle_rad) <= LARGEST:
+        raise ArmcalError(
+            f"the converted arm differs by up to {off.position_m:.1e} m and {off.angle_rad:.1e} rad, "
+            f"more than {LARGEST:g}.",
+            hint="Nothing was written. Please report this with the arm.",
+        )
     _warn_of_what_is_left(console, original, target, off)
     said = (
         f"largest difference over {off.poses} poses: "
@@ -479,21 +470,6 @@ def convert(
 
 def _yaml(section: Mapping[str, Any]) -> str:
     return yaml.safe_dump({"model": section}, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None)
-
-
-def _verified(original: ConvertSource, section: str, target: str, registry: PluginRegistry) -> Difference:
-    try:
-        off = difference(original.chain, reload(section, registry))
-    except PluginError as fault:
-        hint = f"Install the plugin that offers the model {target}."
-        raise PluginError(f"what would be written cannot be checked: {fault.message}", hint=hint) from fault
-    if not max(off.position_m, off.angle_rad) <= LARGEST:
-        raise ArmcalError(
-            f"the converted arm differs by up to {off.position_m:.1e} m and {off.angle_rad:.1e} rad, "
-            f"more than {LARGEST:g}.",
-            hint="Nothing was written. Please report this with the arm.",
-        )
-    return off
 
 
 def _warn_of_what_is_left(console: Console, original: ConvertSource, target: str, off: Difference) -> None:

@@ -55,7 +55,6 @@ class Output(io.FileIO):
 
 
 def output_fault() -> OSError | None:
-    """Why standard output can no longer be written; None while it can."""
     return getattr(getattr(getattr(sys.stdout, "buffer", None), "raw", None), "fault", None)
 
 
@@ -66,7 +65,6 @@ class Screen(RichConsole):
         super().__init__(highlight=False, markup=False, emoji=False, **more)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """As rich does; texts without control characters, while rich's own control codes stay."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(shown(segment.text), segment.style)
 
@@ -183,7 +181,6 @@ class Console:
     def table(
         self, title: str, columns: Iterable[str], rows: Iterable[Iterable[object]], left: Sequence[str] = ()
     ) -> None:
-        """A table of the result; numbers stand to the right but in the first column and those of ``left``."""
         self.out.print(columned(title, columns, rows, left))
 
     def registry(self) -> PluginRegistry:

@@ -65,7 +65,6 @@ def doctor(as_json: bool) -> None:
 
 
 def examine() -> Iterator[Finding]:
-    """Look at everything, in the order of the report."""
     python = f"{platform.python_version()} ({sys.executable}), {platform.platform()}; armcal in {SOURCES}"
     yield Finding("armcal", "Python", "ok", python)
     needs = {name: needed for name, needed in requirements().items() if name != "all"}

@@ -105,7 +105,17 @@ def _checked(experiment: Experiment, ready: Prepared) -> dict[str, Any]:
     known = identify_from(triangle, parameters)
     channels = [*command_channels(experiment.system.arms)]
     angles = {channel: ready.dataset.column(channel)[ready.split.train] for channel in channels}
-    every = parameters.with_free(parameters.names)
+    every, start, aligned = parameters.with_free(parameters.names), ready.start, None
+    if (alignment := start.alignment) is not None:  # where the base and the target were found, in SI
+        turned = zip(alignment.turn.tolist(), alignment.shift.tolist(), strict=True)
+        aligned = {
+            "tracker_T_base": [[*row, x] for row, x in turned],
+            "target_moved_m": alignment.offset.tolist(),
+            "typical_error_as_configured_m": start.configured,
+            "typical_error_aligned_m": alignment.left,
+            "undetermined": list(start.gauges),
+            "start": "aligned" if start.taken else "configured",
+        }
     return {
         "experiment": experiment.name,
         "records": {
@@ -128,23 +138,8 @@ def _checked(experiment: Experiment, ready: Prepared) -> dict[str, Any]:
             channel: {"min": float(values.min()), "max": float(values.max()), "levels": len(np.unique(values))}
             for channel, values in angles.items()
         },
-        "alignment": _alignment(ready.start),
+        "alignment": aligned,
         "warnings": list(ready.notices),
-    }
-
-
-def _alignment(start: Start) -> dict[str, Any] | None:
-    """Where the base and the target were found, in SI; nothing where they are not looked for."""
-    alignment = start.alignment
-    if alignment is None:
-        return None
-    return {
-        "tracker_T_base": [[*row, x] for row, x in zip(alignment.turn.tolist(), alignment.shift.tolist(), strict=True)],
-        "target_moved_m": alignment.offset.tolist(),
-        "typical_error_as_configured_m": start.configured,
-        "typical_error_aligned_m": alignment.left,
-        "undetermined": list(start.gauges),
-        "start": "aligned" if start.taken else "configured",
     }
 
 

@@ -3,6 +3,7 @@
 import difflib
 import errno
 import itertools
+import json
 import os
 import sys
 import traceback
@@ -90,7 +91,15 @@ class LazyGroup(click.Group):
                 stated = missing_library(fault, f"armcal {ctx.invoked_subcommand}")
             if stated is None:
                 raise
-            _report(stated)
+            notes = getattr(stated, "__notes__", [])
+            if isinstance(stated, BrokenPluginError) and stated.__cause__ is not None:
+                say("".join(traceback.format_exception(stated.__cause__)).rstrip(), err=True)
+            if "--json" in sys.argv:
+                error = {"message": str(stated), "exit_code": stated.exit_code, "warnings": notes}
+                click.echo(json.dumps({**JSON_SCHEMA, "error": error}, indent=2))
+            for text in notes:
+                say(f"warning: {text}", err=True)
+            say(f"armcal: {stated}", err=True)
             ctx.exit(stated.exit_code)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
@@ -156,17 +165,3 @@ def _exit_code() -> int:
     except SystemExit as end:
         done = end.code
     return done if isinstance(done, int) else EXIT_DONE
-
-
-def _report(fault: ArmcalError) -> None:
-    notes = getattr(fault, "__notes__", [])
-    if isinstance(fault, BrokenPluginError) and fault.__cause__ is not None:
-        say("".join(traceback.format_exception(fault.__cause__)).rstrip(), err=True)
-    if "--json" in sys.argv:
-        import json
-
-        error = {"message": str(fault), "exit_code": fault.exit_code, "warnings": notes}
-        click.echo(json.dumps({**JSON_SCHEMA, "error": error}, indent=2))
-    for text in notes:
-        say(f"warning: {text}", err=True)
-    say(f"armcal: {fault}", err=True)

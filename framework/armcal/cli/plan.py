@@ -169,7 +169,6 @@ def _plan_document(experiment: Experiment, result: PlanResult) -> Document:
 def _show_iso_plan(
     console: Console, experiment: Experiment, size: float | None, out: Path, options: Mapping[str, Any]
 ) -> None:
-    """Plan the test in a cube of this size (m; None: the largest), write it to ``out`` and show it."""
     began, cycles = time.perf_counter(), options["cycles"]
     cube, dataset, warnings = make_iso_plan(experiment, size, cycles, options["directions"], options["calibration"])
     write_csv(out, dataset, experiment.request(measured=False).channels)

@@ -40,7 +40,6 @@ class Axis:
         return np.asarray(self.start + (inside - low) / (high - low) * (self.end - self.start))
 
     def ticks(self, about: int) -> list[tuple[float, str]]:
-        """Pixels of round values, and their labels."""
         if self.log:
             decades = math.log10(self.high / self.low)
             steps = (1, 2, 5) if decades <= _LOG_ALL_STEPS else (1, 3) if decades <= _LOG_SOME_STEPS else (1,)
@@ -84,7 +83,6 @@ def drawn(figure: Figure, ident: str) -> list[Markup]:
 
 
 def _axes(panel: Panel) -> tuple[Axis, Axis, float]:
-    """Both axes, and the height of the panel."""
     of_x = np.concatenate([np.zeros(0), *(m.xy[0] for m in panel.marks)])
     of_y = np.concatenate([np.zeros(0), *(m.xy[1] for m in panel.marks)])
     low, high = _ends(of_x, panel.log)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,7 +62,6 @@ def plugin_sections(result: RunResult, registry: PluginRegistry) -> tuple[list[S
 
 
 def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Document:
-    """All that a run has to say; ``sections`` are those of plugins."""
     findings, warnings = result.verdict.findings, tuple(dict.fromkeys((*result.warnings, *result.dataset.warnings)))
     urgent = [finding for finding in findings if finding.grade in ("bad", "warning")]
     notes = [finding for finding in findings if finding.grade == "note"]
@@ -73,7 +71,8 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
     summary: list[Part] = list(filter(None, ("" if verdict.bad else verdict.claim, verdict.next_poses)))
     if findings and not urgent:
         summary.append("No warning: the calibration can be used.")
-    worst = worst_records(result)
+    errors = result.errors.calibrated_mm
+    worst = np.argsort(-np.where(np.isnan(errors), np.inf, errors), kind="stable")[:_WORST].astype(np.intp)
     large = worst_table(result, worst) if len(worst) else None
     own = [
         *_accuracy(result),
@@ -263,10 +262,11 @@ def in_space(result: RunResult) -> Figure | None:
     ends = np.geomspace(low, max(high, 1.2 * low), _LEVELS + 1)[1:-1]
     chosen = _thinned(next(reversed(shown.values())), places)
     box, flat = _box(position[:3, places]), _projected(position[:3, chosen])
-    small = " small" if len(chosen) > 600 else ""
+    small, bounds = " small" if len(chosen) > 600 else "", [significant(float(end), 2) for end in ends]
+    names = [f"below {bounds[0]} {unit}", *(f"to {bound}" for bound in bounds[1:]), f"above {bounds[-1]} {unit}"]
     for name, own in shown.items():
         level = np.clip(np.searchsorted(ends, own[chosen]), 0, _LEVELS - 1)
-        marks = [Marks(f"dot{small} l{i}", flat[:, level == i], name=_range(ends, i, unit)) for i in range(_LEVELS)]
+        marks = [Marks(f"dot{small} l{i}", flat[:, level == i], name=names[i]) for i in range(_LEVELS)]
         panels.append(Panel(name, (*box, *marks), equal=True, bare=True))
     said = "; ".join(f"{n}: median {significant(float(np.median(own[places])))} {unit}" for n, own in shown.items())
     spans = [
@@ -276,14 +276,6 @@ def in_space(result: RunResult) -> Figure | None:
     caption = f"Places of the tip, {', '.join(spans)} mm, and the error of each record, {unit}, by one scale."
     caption += drawn_of(len(chosen), len(places))
     return Figure("Error by place", f"{plural(len(places), 'tip position')}; {said}.", caption, panels)
-
-
-def _range(ends: Array, level: int, unit: str) -> str:
-    if level == 0:
-        return f"below {significant(float(ends[0]), 2)} {unit}"
-    if level == _LEVELS - 1:
-        return f"above {significant(float(ends[-1]), 2)} {unit}"
-    return f"to {significant(float(ends[level]), 2)}"
 
 
 def _projected(places: Array) -> Array:
@@ -355,7 +347,6 @@ def _steps(errors: Array, low: float) -> tuple[Array, Array]:
 
 
 def corrections(estimate: Estimate) -> Figure | None:
-    """What was added to each parameter, with its 95 % interval: a panel a unit."""
     nominal, rows = estimate.parameters.nominal(), dict[str, list[tuple[str, float, float, float]]]()
     entries = [(block, unit) for block in estimate.parameters.free for unit in block.entry_units]
     for i, (entry, (block, si)) in enumerate(zip(estimate.free_entries, entries, strict=True)):
@@ -419,7 +410,6 @@ def against_joints(result: RunResult) -> Figure | None:
 
 
 def in_order(result: RunResult, worst: Indices) -> Figure | None:
-    """Calibrated error of each record in recorded order; None without records."""
     errors, (train, holdout) = result.errors.calibrated_mm, roles(result)
     known = np.flatnonzero(np.isfinite(errors))
     if not len(known):
@@ -494,7 +484,6 @@ def errors_table(caption: str, errors: ErrorTable) -> Table:
 
 
 def groups_table(groups: Mapping[str, Mapping[str, Any]], unit: str) -> Table:
-    """What the records of each group miss each other by, before and after; and known distances, where any is known."""
     distances = any(group["distance_error_mm"] is not None for group in groups.values())
     shown = ["nominal_error_mm", "error_mm", *(["nominal_distance_error_mm", "distance_error_mm"] if distances else [])]
     decimals = common_decimals(group[key] for group in groups.values() for key in shown)
@@ -520,16 +509,16 @@ def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None) -> 
         # Two digits of the standard deviation; five of the value where there is none, three decimals of a zero.
         size = sd if math.isfinite(sd) and sd > 0 else max(abs(value), abs(before)) / 1000
         digits = decimals_for(size) if size else 3
-        span = partial(_span, factor, digits)
-        words = span(own.interval.lower, own.interval.upper) if math.isfinite(sd) else NONE
+        spans = [(own.interval.lower, own.interval.upper), *([bootstrap.intervals[i]] if bootstrap is not None else [])]
+        words = [" to ".join(fixed(factor * float(end), digits) for end in ends) for ends in spans]
         remarks = ["at its bound"] if name in estimate.at_bound else []
         remarks += [] if remarks else [f"{end} end at its bound" for end in own.interval.bounds]
         by = estimate.determined_by[i]
         remarks += [] if by == "data" else [DETERMINED_BY[by]]
         row = [name, *(fixed(x, digits) for x in (before, value)), fixed(value - before, digits, True)]
-        row += [fixed(sd, digits), words]
+        row += [fixed(sd, digits), words[0] if math.isfinite(sd) else NONE]
         if bootstrap is not None:
-            row += [fixed(factor * float(bootstrap.deviations[i]), digits), span(*bootstrap.intervals[i])]
+            row += [fixed(factor * float(bootstrap.deviations[i]), digits), words[1]]
         rows.append((*row, unit, ", ".join(remarks)))
     headings = ["Parameter", "Nominal", "Calibrated", "Correction", "sd", "95 % interval"]
     headings += ["Bootstrap sd", "By bootstrap"] if bootstrap else []
@@ -540,10 +529,6 @@ def parameters_table(estimate: Estimate, bootstrap: Bootstrap | None = None) -> 
     return Table(caption, (*headings, "Unit", "Remark"), rows, ("Unit", "Remark"), ("Nominal", "Correction", "sd"))
 
 
-def _span(factor: float, digits: int, lower: float, upper: float) -> str:
-    return " to ".join(fixed(factor * float(end), digits) for end in (lower, upper))
-
-
 def principal_table(estimate: Estimate) -> Table | None:
     factor, unit = shown_unit("rad_per_Nm")
     rows = []
@@ -552,12 +537,6 @@ def principal_table(estimate: Estimate) -> Table | None:
             sizes = np.linalg.eigvalsh(symmetric(estimate.values[estimate.parameters.entries_of(block.name)]))
             rows.append((block.name, *(significant(factor * max(size, 0.0)) for size in sizes)))
     return Table(f"Principal compliances, {unit}", ("Parameter", "Stiffest", "", "Softest"), rows) if rows else None
-
-
-def worst_records(result: RunResult) -> Indices:
-    errors = result.errors.calibrated_mm
-    ranked = np.where(np.isnan(errors), np.inf, errors)
-    return np.argsort(-ranked, kind="stable")[:_WORST].astype(np.intp)
 
 
 def worst_table(result: RunResult, worst: Indices) -> Table:
@@ -620,7 +599,6 @@ def _more(total: int, where: str = "") -> str:
 
 
 def scatter_table(result: RunResult) -> Table | None:
-    """Variance components in a customary unit, the largest share first."""
     rows: list[tuple[str, ...]] = []
     components = result.fit.fitted.components
     for c in sorted(components.components if components else (), key=lambda c: -c.share):

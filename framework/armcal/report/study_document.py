@@ -5,7 +5,7 @@ import numpy as np
 from armcal.report.document import Code, Document, Figure, Marks, Panel, Part, Section, Table
 from armcal.report.numbers import NONE, common_decimals, count, fixed, plural, significant
 from armcal.report.run_document import provenance_facts
-from armcal.run.study import Cell, StudyResult, VariantResult
+from armcal.run.study import Cell, StudyResult
 
 _SAME_MM = 1e-6
 _FEW_GROUPS = 3
@@ -45,7 +45,16 @@ def conclusions(result: StudyResult) -> list[str]:
             f"Simplest within one standard error of it: {simple.name}, {simple.free} free parameters, "
             f"{_shown(simple.crossed.mean, result.unit)}."
         )
-    texts += _nested_words(result, best)
+    if result.nested is not None:
+        chosen, judged, unit = result.nested.chosen, result.nested.crossed, result.unit
+        listed = ", ".join(f"{name} in {chosen.count(name)}" for name in dict.fromkeys(chosen))
+        texts.append(
+            "The choice itself, made inside each fold's training records and judged outside: "
+            f"{_shown(judged.mean, unit)} on average, 95 % below {_shown(judged.p95, unit)} (picked by the records "
+            f"that judge it: {_shown(best.crossed.mean, unit)}). Chosen: {listed} of {result.folds} folds."
+        )
+    elif len(result.variants) > 1:
+        texts.append("The records that judge it also picked it; study.nested: true judges the choice itself.")
     for v in result.variants:
         if abs((v.at_rest.mean or 0.0) - (v.crossed.mean or 0.0)) > _SAME_MM:
             texts.append(
@@ -65,23 +74,7 @@ def conclusions(result: StudyResult) -> list[str]:
     return texts
 
 
-def _nested_words(result: StudyResult, best: VariantResult) -> list[str]:
-    if result.nested is None:
-        if len(result.variants) == 1:
-            return []
-        return ["The records that judge it also picked it; study.nested: true judges the choice itself."]
-    chosen = result.nested.chosen
-    listed = ", ".join(f"{name} in {chosen.count(name)}" for name in dict.fromkeys(chosen))
-    return [
-        "The choice itself, made inside each fold's training records and judged outside: "
-        f"{_shown(result.nested.crossed.mean, result.unit)} on average, 95 % below "
-        f"{_shown(result.nested.crossed.p95, result.unit)} (picked by the records that judge it: "
-        f"{_shown(best.crossed.mean, result.unit)}). Chosen: {listed} of {result.folds} folds."
-    ]
-
-
 def _transfers(result: StudyResult) -> list[str]:
-    """How much an error grows from the group that trained to another."""
     texts, several = [], len(result.groups) > _FEW_GROUPS
     for variant in result.variants:
         single = [c for c in result.cells if c.variant == variant.name and len(c.trained_at) == 1]
@@ -152,7 +145,6 @@ def _shown(value: float | None, unit: str) -> str:
 
 
 def _ladder(result: StudyResult) -> Figure:
-    """Errors of each variant."""
     said = "; ".join(
         f"{v.name}: mean {_said(v.crossed.mean)}, 95 % {_said(v.crossed.p95)} {result.unit}" for v in result.variants
     )

@@ -5,6 +5,7 @@ Settings go beyond what the arm is: data, parameters, estimator, validation, sim
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
 from functools import partial
@@ -44,7 +45,6 @@ _AT = ("plan", "clearance")
 
 
 def clearance_check(settings: Clearance, arms: Mapping[str, Arm], source: ConfigSource) -> ClearanceCheck:
-    """The check that the settings describe."""
     arm = only_arm(arms, "clearance is checked for a single arm", "Leave the clearance out.", source.where(_AT))
     frames = joints_of_frames(arm)
     for name, shapes in settings.parts.items():
@@ -148,8 +148,6 @@ class PlanSettings(Settings):
 
 
 class ExperimentSettings(Settings):
-    """A whole configuration; components keep their own settings under ``type``."""
-
     name: str = ""
     arms: dict[str, Any]
     measurements: dict[str, Any]
@@ -330,14 +328,17 @@ class Experiment:
 
     def provenance(self, dataset: Dataset) -> dict[str, Any]:
         """Where the numbers of a run on these records come from: files, hashes, versions."""
-        packages = {name: _version(name) for name in ("armcal", "numpy", "scipy", "casadi", "cvxpy")}
+        packages = {"python": sys.version.split()[0]}
+        for name in ("armcal", "numpy", "scipy", "casadi", "cvxpy"):
+            with suppress(PackageNotFoundError):
+                packages[name] = version(name)
         return {
             "config": str(self.source.path),
             "config_files": [Path(file).name for file in self.source.files],
             "data": dataset.source,
             "data_sha256": dataset.sha256,
             "arm_sha256": identity_of(self.system.description),
-            "versions": {"python": sys.version.split()[0], **{name: v for name, v in packages.items() if v}},
+            "versions": packages,
             "plugins": {p.name: f"{p.distribution} {p.version}" for p in self.registry.plugins if not p.fault},
         }
 
@@ -383,10 +384,3 @@ def _gravity_warnings(settings: ExperimentSettings, gravity: Array) -> list[str]
     if gravity[2] > 0:
         texts.append("gravity points up along the base frame's z axis: right only for an arm that hangs.")
     return texts
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""

@@ -130,7 +130,6 @@ def assemble(
 
 
 def acting(problem: Problem, dataset: Dataset) -> Problem:
-    """The problem with the noise of joints, and with what drifts."""
     nominal = problem.parameters.nominal()
     return with_drift(with_joint_noise(problem, nominal), dataset, nominal)
 
@@ -139,7 +138,22 @@ def _checked(experiment: Experiment, dataset: Dataset, problem: Problem, start: 
     """Split, and checked by every check of data; what one calls bad is refused unless it is accepted."""
     system, settings, plan = experiment.system, experiment.settings, experiment.settings.plan
     unlearned(system)
-    require_loads(experiment, dataset)
+    # Free springs need something that loads them: a link's mass, a payload, a force or a torque.
+    statics, loads = system.statics, [c for c in LOAD_CHANNELS[3:] if dataset.has(c) and dataset.column(c).any()]
+    loaded = bool(loads) or statics.payload or any((*statics.force, *statics.torque))
+    free = [block.name for block in experiment.parameters.free]
+    for name, arm in system.arms.items():
+        elastic = {effect for effect, one in arm.effects.items() if type(one).springs is not JointEffect.springs}
+        springs = [own for own in free if own.startswith(f"{name}.") and own.split(".")[1] in elastic]
+        weigh = any(mass.mass for mass in arm.masses) or any(own.startswith(f"{name}.links.") for own in free)
+        if springs and arm.deflection_size and not (loaded or weigh):
+            raise ConfigError(
+                f"the springs of {name} are free ({first_few(springs)}), and nothing loads them: no link has a mass, "
+                "and no payload, force or torque is stated.",
+                where=experiment.source.where(("arms", name, "effects")),
+                hint=f"State masses (arms.{name}.links: mass, com and frame of each) or statics.payload_g; or take the "
+                "springs out. Without loads what bends is taken for lengths.",
+            )
     ready = Prepared(system, dataset, problem, experiment.split(dataset), start)
     for check in (*DATA_CHECKS, *plugin_checks(experiment.registry, before_fit=True)):
         findings = check.findings(ready)
@@ -166,27 +180,6 @@ def _checked(experiment: Experiment, dataset: Dataset, problem: Problem, start: 
         limit_mm=None if limit is None else limit * _MM,
         limits={} if plan is None else {**plan.limits, **plan.travel_limits},
     )
-
-
-def require_loads(experiment: Experiment, dataset: Dataset) -> None:
-    """Free springs need something that loads them: a link's mass, a payload, a force or a torque."""
-    statics, channels = experiment.system.statics, LOAD_CHANNELS[3:]
-    stated = statics.payload or any((*statics.force, *statics.torque))
-    if stated or any(dataset.has(channel) and dataset.column(channel).any() for channel in channels):
-        return
-    free = [block.name for block in experiment.parameters.free]
-    for name, arm in experiment.system.arms.items():
-        elastic = {effect for effect, one in arm.effects.items() if type(one).springs is not JointEffect.springs}
-        springs = [own for own in free if own.startswith(f"{name}.") and own.split(".")[1] in elastic]
-        weigh = any(mass.mass for mass in arm.masses) or any(own.startswith(f"{name}.links.") for own in free)
-        if springs and arm.deflection_size and not weigh:
-            raise ConfigError(
-                f"the springs of {name} are free ({first_few(springs)}), and nothing loads them: no link has a mass, "
-                "and no payload, force or torque is stated.",
-                where=experiment.source.where(("arms", name, "effects")),
-                hint=f"State masses (arms.{name}.links: mass, com and frame of each) or statics.payload_g; or take the "
-                "springs out. Without loads what bends is taken for lengths.",
-            )
 
 
 def fitted(context: RunContext, ready: Prepared) -> WeighedFit:
@@ -218,7 +211,6 @@ def _widened(own: Fit) -> WeighedFit:
 
 
 def with_pose_residual(context: RunContext, plain: Fit) -> tuple[Fit, ResidualOutcome | None]:
-    """The fit with the pose residual that is to be learned, where it is kept, and what became of it."""
     experiment, ready = context.experiment, plain.ready
     layer = layer_of(experiment.system, ready.trained)
     if layer is None or not plain.converged:
@@ -238,7 +230,6 @@ def with_pose_residual(context: RunContext, plain: Fit) -> tuple[Fit, ResidualOu
 
 
 def uncertainty(context: RunContext, plain: Fit) -> Bootstrap | None:
-    """What was asked for beyond the covariance, of a fit that converged."""
     experiment, estimate, ready = context.experiment, plain.estimate, plain.ready
     settings = experiment.settings.uncertainty
     if not (settings.bootstrap and plain.converged and estimate.names):
@@ -266,7 +257,6 @@ def validated(context: RunContext, own: Fit) -> Fit:
 
 
 def judged(context: RunContext, own: Fit, outcome: ResidualOutcome | None) -> RunResult:
-    """What a run knows of its fit, with the verdict on it."""
     experiment, failed = context.experiment, own.crossed.failed_folds if own.crossed else 0
     with context.watch.stage("judge"):
         context.progress("judging", 0.0)

@@ -59,8 +59,6 @@ _BARRED = "too little clearance"
 
 @dataclass(frozen=True)
 class JointSpace:
-    """The joints of all arms, in order."""
-
     channels: tuple[str, ...]  # of their commands (``arm.q1``)
     names: tuple[str, ...]  # as a configuration calls them (``q1``; ``left.q1`` where there are several arms)
     dimensions: tuple[str, ...]  # ``angle`` or ``length``
@@ -74,7 +72,6 @@ class JointSpace:
     def by_joint(
         self, turning: Mapping[str, Sequence[float]], sliding: Mapping[str, Sequence[float]], keys: tuple[str, str]
     ) -> dict[str, Array]:
-        """What is given of joints, by name."""
         dimensions = dict(zip(self.names, self.dimensions, strict=True))
         stated = by_dimension(dimensions, turning, sliding, (f"plan.{keys[0]}", f"plan.{keys[1]}"))
         return {name: np.array(values) for name, values in stated.items()}
@@ -86,7 +83,6 @@ class JointSpace:
 
 
 def stated_beyond(experiment: Experiment, stated: Mapping[str, Limits]) -> tuple[str, ...]:
-    """A sentence for each joint whose stated limits (rad or m) go beyond those of its model."""
     texts, arms = [], experiment.system.arms
     own = {
         f"{name}.{joint}": ends
@@ -132,7 +128,6 @@ def clearance_of(experiment: Experiment) -> Allowed | None:
 def _pool_of(
     experiment: Experiment, settings: PlanSettings, space: JointSpace, listed: Path | None, check: Allowed | None
 ) -> Pool:
-    """Every candidate that lies within limits and keeps its clearance."""
     limits = space.limits(settings)
     usual = "continuous" if experiment.settings.data is None and np.isfinite(limits).all() else "recorded"
     kind = "listed" if listed is not None else settings.candidates or usual
@@ -185,7 +180,6 @@ def read_poses(experiment: Experiment, path: Path | None) -> Dataset:
 
 
 def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:
-    """What is commanded and what acts, without what was measured."""
     kept = {
         name: values
         for name, values in dataset.channels.items()
@@ -230,7 +224,6 @@ def spread(settings: PlanSettings, space: JointSpace, limits: Array, check: Allo
 
 
 def _dataset_of(poses: Array, space: JointSpace) -> Dataset:
-    """Poses (joints x N) with ids from 1."""
     ids = tuple(str(i) for i in range(1, poses.shape[1] + 1))
     return Dataset(ids, dict(zip(space.channels, np.ascontiguousarray(poses), strict=True)), source="plan")
 
@@ -240,7 +233,6 @@ def counts_text(left_out: Mapping[str, int]) -> str:
 
 
 def options_within(path: Path, joints: Sequence[str], registry: PluginRegistry) -> Options:
-    """Compensation within limits and clearance of a configuration's ``plan``, for an arm with these joints."""
     experiment = Experiment.load(path, registry=registry)
     plan = experiment.settings.plan
     if plan is None:
@@ -277,7 +269,6 @@ class PlanContext:
 
     @cached_property
     def priors(self) -> Array:
-        """As rows of information."""
         scales, prior = self.parameters.scales(), self.parameters.prior_information()
         return np.diag(scales * np.sqrt(prior))[prior > 0]
 
@@ -299,7 +290,6 @@ class PlanContext:
 
 
 def _values_about(experiment: Experiment, calibration: Path | None) -> Parameters:
-    """An experiment's parameters, at the values of a calibration if one is given."""
     parameters = experiment.parameters
     if calibration is None:
         return parameters
@@ -380,10 +370,6 @@ def with_approaches(dataset: Dataset, space: JointSpace, signs: Array) -> Datase
 
 
 def come_from_both_sides(pool: Pool, space: JointSpace, limits: Array, seed: int) -> Pool:
-    """Each candidate twice, each of its joints from one side and from the other, as far as limits (joints x 2) allow.
-
-    Recorded and listed poses have the approaches that were recorded, or none.
-    """
     if pool.kind not in PLANNED:
         return pool
     count, poses = len(pool.dataset), pool.dataset.stacked(space.channels)
@@ -450,7 +436,6 @@ def make_plan(
     calibration: Path | None = None,
     progress: Progress = no_progress,
 ) -> PlanResult:
-    """Plan so many poses: of ``listed`` candidates or the configured ones, after ``records``, about a calibration."""
     settings = experiment.settings.plan or PlanSettings()
     space = JointSpace.of(experiment)
     if touching := grouped_instances(experiment.system.measurements):
@@ -534,7 +519,6 @@ def _chosen(task: Task, settings: PlanSettings, parameters: Parameters) -> Plan:
 def _refined(
     context: PlanContext, task: Task, plan: Plan, pool: Pool, allowed: Allowed
 ) -> tuple[Task, Plan, Pool, int]:
-    """The chosen poses moved through joint space, and chosen again from all candidates and these."""
     space, limits = context.space, context.space.limits(context.settings)
     sides = approach_channels(space) if pool.dataset.has(approach_channels(space)[0]) else ()
     channels, count = (*space.channels, *sides), len(space.channels)
@@ -627,8 +611,6 @@ _NO_CLEARANCE = "no clearance is stated (plan.clearance): nothing here keeps the
 
 @dataclass(frozen=True)
 class Cube:
-    """A cube along the axes of the base frame, and the commands of its poses."""
-
     size: float  # of an edge (m)
     centre: Array  # 3 (m)
     rotation: Array | None  # base_R_tool in all poses (3 x 3); None for an arm that cannot keep one
@@ -670,7 +652,6 @@ def _placed(compensator: Compensator, starts: Array, size: float | None) -> Cube
 def _reached(
     compensator: Compensator, tools: Array, about: Array, rotations: Array | None, commands: Array
 ) -> tuple[Mask, Array]:
-    """Whether all points about tools (M x 4 x 4; k x 3, m) are reached from commands (M x k x n), and by which."""
     targets = compensator.targets((tools[:, None, :3, 3] + about).reshape(-1, 3), rotations)
     poses = compensator.onward(targets, commands.reshape(-1, commands.shape[2]))
     return np.all(poses.reached.reshape(-1, len(about)), axis=1), poses.joint_angles.reshape(commands.shape)
@@ -718,10 +699,7 @@ def _table(
 def make_iso_plan(
     experiment: Experiment, size: float | None, cycles: int, directions: int, calibration: Path | None = None
 ) -> tuple[Cube, Dataset, tuple[str, ...]]:
-    """The test in a cube of this size (m), or the largest that fits; for the rigid nominal arm, or a calibrated one.
-
-    Gives the cube, the visits in order, and warnings.
-    """
+    """The test in a cube of this size (m), or the largest that fits; for the rigid nominal arm, or a calibrated one."""
     alone = "Describe the arm that is to be tested alone."
     arm = only_arm(experiment.system.arms, "the test is of a single arm", alone)
     settings, check = experiment.settings.plan or PlanSettings(), clearance_of(experiment)

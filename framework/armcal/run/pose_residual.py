@@ -49,8 +49,6 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors of records by fits that did not see them, without and with a pose residual."""
-
     without: float  # mean error (mm, or mrad)
     with_it: float
     sure: float  # the difference in standard errors, of the measurement where it is least; above 0 where all are better
@@ -145,7 +143,6 @@ class Layer:
 
 
 def unlearned(system: System) -> Arm | None:
-    """The arm whose pose residual is to be learned."""
     arms = [arm for arm in system.arms.values() if arm.residual is not None and not arm.residual.is_learned]
     if not arms:
         return None
@@ -164,7 +161,6 @@ def unlearned(system: System) -> Arm | None:
 
 
 def layer_of(system: System, dataset: Dataset) -> Layer | None:
-    """What folds of these records need to learn; None where no pose residual is to be learned."""
     arm = unlearned(system)
     if arm is None or arm.residual is None:
         return None
@@ -174,7 +170,6 @@ def layer_of(system: System, dataset: Dataset) -> Layer | None:
 def learned_residual(
     experiment: Experiment, layer: Layer, plain: Fit, progress: Progress, executor: Executor | None
 ) -> ResidualOutcome:
-    """Learn from the training records, and judge by folds of them, and by stretches of the recording."""
     training, fitted = plain.ready.training, plain.fitted
     order = np.argsort(plain.position[plain.split.train], kind="stable")
     count, kind = training.count, str(experiment.system.description["arms"][layer.arm]["residual"]["type"])
@@ -275,7 +270,6 @@ def model_errors(fitted: WeighedFit, arm: Arm, postures: Postures) -> ModelError
 
 
 def _determined(slopes: Array) -> bool:
-    """Whether each record alone determines corrections (N x rows x corrections)."""
     if slopes.shape[1] < slopes.shape[2]:
         return False
     sizes = np.linalg.svd(slopes / np.linalg.norm(slopes, axis=1, keepdims=True).clip(1e-300), compute_uv=False)

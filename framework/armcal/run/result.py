@@ -47,8 +47,6 @@ _MM = 1000.0
 
 @dataclass(frozen=True)
 class SuspiciousRecord:
-    """A training record beyond its limit."""
-
     row: int  # of the source; 0 if it has none
     record_id: str
     measurement: str
@@ -74,7 +72,6 @@ def suspicious_records(fit: Fit) -> tuple[SuspiciousRecord, ...]:
 
 
 def noise_content(fit: Fit, suspicious: Sequence[SuspiciousRecord]) -> dict[str, Any]:
-    """How the records weighed, and what the fit leaves unexplained, for metrics.json and calibration.yaml."""
     fitted, estimate = fit.fitted, fit.estimate
     content: dict[str, Any] = {"loss": fitted.loss}
     if fitted.loss != "none":
@@ -231,7 +228,6 @@ _OURS = (*(f"calibration.yaml{suffix}" for suffix in _SUFFIXES), *FILES)
 
 
 def reserved(folder: Path) -> AbstractContextManager[plain_files.Reservation]:
-    """Keep a folder for one run."""
     return plain_files.reserved(folder, _OURS)
 
 
@@ -270,7 +266,6 @@ def write(
 
 
 def metrics(result: RunResult) -> dict[str, Any]:
-    """The numbers of a run for other programs."""
     estimate, known, verdict = result.estimate, result.estimate.identifiability, result.verdict
     resampled: dict[str, Any] | None = None
     if (bootstrap := result.bootstrap) is not None:
@@ -378,7 +373,6 @@ def calibration_content(result: RunResult, experiment: Experiment, accepted: boo
 
 
 def read_back(text: str, registry: PluginRegistry) -> Calibration:
-    """The calibration that a text is once it is a file."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CalibrationWarning)
         return Calibration.load("calibration.yaml", registry, content=text.encode())
@@ -391,7 +385,6 @@ def _noise(result: RunResult) -> dict[str, Any]:
 
 
 def residuals_text(result: RunResult) -> str:
-    """A row a record, worst found easily by sorting."""
     errors, dataset = result.errors, result.dataset
     held = np.zeros(len(dataset), dtype=bool)
     held[result.split.holdout] = True

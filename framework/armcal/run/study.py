@@ -121,8 +121,6 @@ class VariantResult:
 
 @dataclass(frozen=True)
 class NestedResult:
-    """The choice itself, judged: made inside of each fold's training records, its errors on the fold (mm)."""
-
     crossed: ErrorSummary
     chosen: tuple[str, ...]  # by each fold
     errors_mm: Array  # N; nan where the chosen fit did not converge
@@ -130,8 +128,6 @@ class NestedResult:
 
 @dataclass(frozen=True)
 class Cell:
-    """One variant trained at some groups of records and judged at one, as JSON has it."""
-
     variant: str
     trained_at: tuple[str, ...]  # none for the nominal model
     judged_at: str
@@ -143,8 +139,6 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class StudyResult:
-    """A finished study."""
-
     name: str
     command: str  # that repeats it
     dataset: Dataset
@@ -191,8 +185,6 @@ class StudyResult:
 
 @dataclass(frozen=True)
 class Study:
-    """A configuration with its variants, checked and built, before any data is read."""
-
     name: str
     source: ConfigSource
     settings: StudySettings
@@ -206,7 +198,6 @@ class Study:
         data: str | Path | None = None,
         registry: PluginRegistry | None = None,
     ) -> Self:
-        """Read and check a study; the arguments are those of ``Experiment.load``."""
         registry = registry or discover()
         read = load_variants(path, overrides)
         source = read.base
@@ -270,8 +261,6 @@ def _prepared(experiment: Experiment, progress: Progress) -> Prepared:
 
 @dataclass(frozen=True)
 class _Training:
-    """Records that train, all or those of one group, and folds of them."""
-
     groups: tuple[str, ...]
     train: Indices
     folds: tuple[Split, ...]
@@ -304,7 +293,6 @@ def compare(
     progress: Progress = no_progress,
     watch: Stopwatch | None = None,
 ) -> StudyResult:
-    """Judge every variant by cross-validation."""
     watch, settings = watch or Stopwatch(), study.settings
     with watch.stage("prepare"):
         ready = study.prepare(progress)
@@ -392,10 +380,7 @@ def _fits(
     progress: Progress,
     watch: Stopwatch,
 ) -> list[JudgedFit]:
-    """Each variant of a plan fitted to the records that train and judged on those held out.
-
-    By compiled functions where the choice was left open and the work (records to fit) is worth it.
-    """
+    """Each variant of a plan fitted to the records that train and judged on those held out."""
     work = len(next(iter(ready.values())).dataset) * len(plan) // len(ready)
     with watch.stage("compile"):
         open_choice = [name for name in ready if study.experiments[name].settings.evaluator == "auto"]
@@ -414,7 +399,6 @@ def _fits(
 
 
 def _fit(judging: tuple[FitTask, Layer | None]) -> JudgedFit:
-    """A fit judged, with the pose residual that it learns where one is to be learned."""
     task, layer = judging
     return fit_and_judge(task) if layer is None else judged_with(task, layer)
 
@@ -424,7 +408,6 @@ def _compile(problem: Problem) -> None:
 
 
 def _judged(name: str, ready: Prepared, fits: Sequence[JudgedFit], whole: _Training) -> VariantResult:
-    """A variant by its fit to all records, and by those of the folds."""
     nominal, nominal_turns = _nominal(ready)
     of_all, own = fits[0], fits[: len(whole.splits)]
     errors, at_rest, turned = whole.errors(own)
@@ -460,7 +443,6 @@ def _nominal(ready: Prepared) -> tuple[Array, Array | None]:
 
 
 def _compared(plain: Sequence[VariantResult], settings: StudySettings) -> tuple[VariantResult, ...]:
-    """Each with its change against the one before or the reference, unless it is that itself."""
     by_name = {result.name: result for result in plain}
     others = [plain[0], *plain] if settings.reference == PREVIOUS else [by_name[settings.reference]] * len(plain)
     return tuple(
@@ -611,8 +593,6 @@ class FreedStep:
 
 @dataclass(frozen=True)
 class FixedParameters:
-    """What fixed parameters would gain, as JSON has it."""
-
     unit: str  # of errors
     error: float | None  # mean error of records held out, as configured
     gaining: tuple[FreedStep, ...]  # parameters that explain residuals, in the order in which they are freed
