@@ -14,7 +14,7 @@ from armcal.base import se3
 from armcal.base.parameters import ParameterBlock
 from armcal.base.poses import PoseSettings, pose_blocks, pose_transform, quaternion_expression
 from armcal.base.settings import Angle, Length, Settings
-from armcal.measure.instrument import Contact
+from armcal.measure.measurement import Contact
 from pydantic import Field, model_validator
 
 

@@ -23,7 +23,7 @@ from armcal.estimate.simulation import (
     with_channels,
     with_outliers,
 )
-from armcal.measure.instrument import LimitedView
+from armcal.measure.measurement import LimitedView
 from armcal.problem.problem import Problem
 from armcal.problem.variants import as_seen
 from pydantic import Field

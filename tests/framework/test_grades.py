@@ -12,7 +12,7 @@ import planted_mistakes
 import pytest
 from armcal.cli.main import cli
 from armcal.diagnose.gross import overfitted
-from armcal.planning.suggestion import Suggestion, is_worth_measuring
+from armcal.planning.exchange import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner

@@ -20,8 +20,7 @@ from armcal.estimate.simulation import TruthfulSimulator
 from armcal.estimate.start import carriers_of
 from armcal.io.folder import check_folder
 from armcal.io.plain_files import write_over
-from armcal.measure.instrument import Rendering
-from armcal.measure.measurement import borrowed_names
+from armcal.measure.measurement import Rendering, borrowed_names
 from armcal.measure.tables import write_csv
 from armcal.problem.problem import Problem
 from armcal.report.document import Document, Section, Table

@@ -27,7 +27,7 @@ from armcal.estimate.identifiability import deviations as deviations_of
 from armcal.estimate.prediction import NewRecording
 from armcal.estimate.validation import Halves, pose_size, summarise
 from armcal.measure.measurement import Placed
-from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
+from armcal.planning.exchange import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 
