@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from armcal.arm.effects import JointEffect
 from armcal.base.dataset import Dataset
-from armcal.measure.instrument import ArmsAlone
+from armcal.measure.measurement import ArmsAlone
 from armcal.problem.problem import Problem
 from armcal.run.experiment import Experiment
 

@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     from armcal.errors import NotConvergedError as NotConvergedError
     from armcal.estimate.estimator import Estimate as Estimate
     from armcal.hooks import hookimpl as hookimpl
-    from armcal.measure.instrument import Contact as Contact
-    from armcal.measure.instrument import Instrument as Instrument
-    from armcal.measure.instrument import InstrumentSettings as InstrumentSettings
     from armcal.measure.measurement import Channel as Channel
+    from armcal.measure.measurement import Contact as Contact
+    from armcal.measure.measurement import Instrument as Instrument
+    from armcal.measure.measurement import InstrumentSettings as InstrumentSettings
     from armcal.plugins import use_plugins as use_plugins
     from armcal.report.document import ReportSection as ReportSection
     from armcal.run.pipeline import calibrate as calibrate
@@ -85,8 +85,7 @@ _FOR_PLUGINS = {
     "armcal.base.parameters": "scalar",
     "armcal.base.settings": "Angle Compliance Force Length Length3 Mass Temperature Torque",
     "armcal.diagnose.checks": "Finding",
-    "armcal.measure.instrument": "Contact Instrument InstrumentSettings",
-    "armcal.measure.measurement": "Channel",
+    "armcal.measure.measurement": "Channel Contact Instrument InstrumentSettings",
     "armcal.plugins": "use_plugins",
     "armcal.report.document": "ReportSection",
 }

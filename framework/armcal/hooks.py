@@ -139,7 +139,7 @@ _KINDS = {
         "measurements",
         "Measurement(settings, arm_names)",
         "measure.measurement:Measurement",
-        "measure.instrument:Instrument",
+        "measure.measurement:Instrument",
         *(f"measure.measurement:{name}" for name in ("RecordNoise", "DimensionedResidual", "GroupedMeasurement")),
         "measure.measurement:NamesGroups",
         "measure.groups:PairedMeasurement",

@@ -32,9 +32,8 @@ from armcal.estimate.identifiability import (
 from armcal.estimate.polish import descended, restricted, started
 from armcal.estimate.robust import EFFICIENCY_OF_MEDIAN, studentised_distances
 from armcal.estimate.start import Start, with_proposals
-from armcal.measure.instrument import Proposing
-from armcal.measure.measurement import Measurement
-from armcal.planning.suggestion import Suggestion, suggest
+from armcal.measure.measurement import Measurement, Proposing
+from armcal.planning.exchange import Suggestion, suggest
 from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.records import declared
 from armcal.problem.variants import as_seen, factor_at_zero, with_joint_noise

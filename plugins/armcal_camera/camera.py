@@ -16,8 +16,15 @@ from armcal.base.parameters import ParameterBlock, scalar
 from armcal.base.poses import PoseSettings, pose_transform
 from armcal.base.quaternions import quaternion_of
 from armcal.base.se3 import identity
-from armcal.measure.instrument import InstrumentSettings, PointInstrument, Proposal, Reading, spread_points
-from armcal.measure.measurement import Channel, Mistake
+from armcal.measure.measurement import (
+    Channel,
+    InstrumentSettings,
+    Mistake,
+    PointInstrument,
+    Proposal,
+    Reading,
+    spread_points,
+)
 from pydantic import Field, model_validator
 
 from armcal_camera.board import Board, BoardOrFile, Chessboard, require_distinct

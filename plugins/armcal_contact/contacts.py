@@ -20,8 +20,7 @@ from armcal.base.poses import (
 )
 from armcal.base.settings import Angle, Length, Length3, Settings
 from armcal.measure.groups import OTHER
-from armcal.measure.instrument import ContactSettings, Instrument, InstrumentSettings, OneArmContact
-from armcal.measure.measurement import Channel, Tie
+from armcal.measure.measurement import Channel, ContactSettings, Instrument, InstrumentSettings, OneArmContact, Tie
 from pydantic import Field, field_validator, model_validator
 
 

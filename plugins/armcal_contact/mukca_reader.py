@@ -21,8 +21,7 @@ from armcal.base.settings import InputPath, Settings
 from armcal.errors import DataError, Location
 from armcal.io.plain_files import input_bytes, refuse
 from armcal.measure.checks import read_as
-from armcal.measure.instrument import named_arm
-from armcal.measure.measurement import GroupedMeasurement, noise_channels
+from armcal.measure.measurement import GroupedMeasurement, named_arm, noise_channels
 from armcal.measure.reader import ReadRequest, RequestedChannel
 from armcal.measure.tables import open_table, read_cell
 

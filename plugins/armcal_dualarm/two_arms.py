@@ -25,7 +25,7 @@ from armcal.base.settings import Angle, InputPath, Length, Settings
 from armcal.base.units import from_unit
 from armcal.io.plain_files import refuse
 from armcal.measure.checks import read_as
-from armcal.measure.instrument import Contact
+from armcal.measure.measurement import Contact
 from armcal.measure.reader import ReadRequest
 from armcal.measure.rests import StillSettings, rests
 from armcal.measure.tables import Columns, is_missing, is_number, open_table

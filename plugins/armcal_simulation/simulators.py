@@ -27,8 +27,7 @@ from armcal.estimate.simulation import (
     with_outliers,
 )
 from armcal.measure.groups import ONLY, group_blocks, owner_of
-from armcal.measure.instrument import LimitedView
-from armcal.measure.measurement import GroupedMeasurement, Measurement
+from armcal.measure.measurement import GroupedMeasurement, LimitedView, Measurement
 from armcal.problem.problem import Problem
 from armcal.problem.variants import as_seen, fits, joint_channels, projected
 from pydantic import Field

@@ -18,8 +18,7 @@ from armcal.base.poses import (
     rotation_of,
 )
 from armcal.base.settings import Angle, Angle3, Length, Length3
-from armcal.measure.instrument import Instrument, InstrumentSettings
-from armcal.measure.measurement import Channel, Mistake
+from armcal.measure.measurement import Channel, Instrument, InstrumentSettings, Mistake
 from pydantic import field_validator
 
 

@@ -16,7 +16,7 @@ from armcal.diagnose.fit import Fit, Prepared
 from armcal.diagnose.gross import overfit
 from armcal.estimate.robust import WeighedFit
 from armcal.estimate.validation import Split
-from armcal.planning.suggestion import Suggestion, is_worth_measuring
+from armcal.planning.exchange import Suggestion, is_worth_measuring
 from armcal.run.experiment import Experiment
 from armcal.run.pipeline import calibrate
 from click.testing import CliRunner

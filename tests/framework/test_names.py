@@ -8,7 +8,7 @@ import pytest
 from armcal.base.dataset import Dataset
 from armcal.errors import ConfigError, DataError
 from armcal.measure.groups import record_keys
-from armcal.measure.instrument import Contact
+from armcal.measure.measurement import Contact
 from armcal.run.experiment import Experiment
 from outside import armcal
 

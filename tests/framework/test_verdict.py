@@ -15,7 +15,7 @@ from armcal.diagnose.verdict import _good_for
 from armcal.estimate.estimator import estimate
 from armcal.estimate.identifiability import POOR_CONDITION, analyse
 from armcal.estimate.robust import limit_of, median_norm
-from armcal.planning.suggestion import suggest
+from armcal.planning.exchange import suggest
 from armcal.problem.problem import Problem
 from armcal.run import result as results
 from armcal.run.experiment import Experiment

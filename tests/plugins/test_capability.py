@@ -17,7 +17,7 @@ from armcal.cli.main import cli
 from armcal.config.system import build_system
 from armcal.config.yaml_source import load_config
 from armcal.errors import ConfigError, ProblemError
-from armcal.measure.instrument import ArmsAlone
+from armcal.measure.measurement import ArmsAlone
 from armcal.plugins import discover
 from armcal.problem.problem import Problem
 from armcal_capability.capability import (

@@ -8,7 +8,7 @@ import socket
 
 import pytest
 from armcal.errors import ConfigError, InputError
-from armcal_contact.json_joints import JointMessages, JsonLinesJoints, JsonLinesJointSettings, RefusedLine
+from armcal_contact.json_joints import JsonLinesJoints, JsonLinesJointSettings, _Messages, _RefusedLine
 
 CHANNELS = ("arm.j1", "arm.j2")
 
@@ -147,5 +147,5 @@ def test_a_source_that_is_none_is_refused(source):
 
 
 def test_a_line_that_is_too_long_is_refused():
-    with pytest.raises(RefusedLine, match="it is too long"):
-        JointMessages(CHANNELS, {}, None, None, "time_s").read(None)
+    with pytest.raises(_RefusedLine, match="it is too long"):
+        _Messages(JsonLinesJointSettings(source="-"), CHANNELS).read(None, 0.0)

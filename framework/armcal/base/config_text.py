@@ -96,7 +96,6 @@ def resolve_path(text: ConfigText | str) -> Path:
 
 
 def as_line(content: Mapping[str, Any]) -> str:
-    """One line of JSON; numbers that are not finite become null."""
     try:
         return json.dumps(content, allow_nan=False)
     except ValueError:

@@ -51,11 +51,7 @@ class Dataset:
         return Location(self.source or None, row=None if index is None else self.row(index), field=field)
 
     def column(self, channel: str) -> Array:
-        """One channel.
-
-        Raises:
-            DataError: the dataset has no such channel.
-        """
+        """One channel; a DataError if the dataset has none."""
         if channel not in self.channels:
             raise DataError(
                 f"{self.source or 'the dataset'} has no values for {channel}; it has {', '.join(self.channels)}."

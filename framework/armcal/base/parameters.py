@@ -83,11 +83,7 @@ class DeclaresParameters(Protocol):
 
 
 def declared(component: DeclaresParameters) -> tuple[ParameterBlock, ...]:
-    """The blocks that a component declares, under local names.
-
-    Raises:
-        PluginError: they are no blocks, or a name, a unit, a nominal value or a scale makes no sense.
-    """
+    """The blocks that a component declares, under local names; a PluginError if they make no sense."""
     blocks, method = component.parameters(), component.parameters
     with expecting(method, blocks, "a sequence of ParameterBlock, as scalar() makes them"):
         blocks = tuple(blocks)
@@ -256,32 +252,23 @@ class Parameters:
         places, entries, increments = np.array(numbers, dtype=np.intp).reshape(-1, 3).T
         return _Layout(places, entries, increments, tuple(others), (entry, increment))
 
-    def _per_increment(self, of: Callable[[ParameterBlock], float]) -> Array:
-        return np.array([of(block) for block in self.coordinate_blocks])
-
     def scales(self) -> Array:
         """The typical scale of each coordinate."""
-        return self._per_increment(lambda block: block.scale)
+        return np.array([block.scale for block in self.coordinate_blocks])
 
     def increment_scales(self) -> Array:
         """The typical scale of each increment."""
-        return self._per_increment(lambda block: block.domain.increment_scale(block.scale))
+        return np.array([block.domain.increment_scale(block.scale) for block in self.coordinate_blocks])
 
     def prior_information(self) -> Array:
         """1/sd^2 of each coordinate's prior, 0 where there is none."""
-        return self._per_increment(lambda block: 0.0 if block.prior_sd is None else block.prior_sd**-2)
+        return np.array([0.0 if b.prior_sd is None else b.prior_sd**-2 for b in self.coordinate_blocks])
 
     def increment_bounds(self) -> tuple[Array, Array]:
         """Lower and upper bound of each increment from the nominal values; infinite for all but intervals."""
-
-        def ends(block: ParameterBlock) -> tuple[float, float]:
-            domain = block.domain
-            return (domain.lower, domain.upper) if isinstance(domain, Interval) else (-math.inf, math.inf)
-
-        return (
-            self._per_increment(lambda block: ends(block)[0] - block.nominal[0]),
-            self._per_increment(lambda block: ends(block)[1] - block.nominal[0]),
-        )
+        lower = [getattr(block.domain, "lower", -math.inf) - block.nominal[0] for block in self.coordinate_blocks]
+        upper = [getattr(block.domain, "upper", math.inf) - block.nominal[0] for block in self.coordinate_blocks]
+        return np.array(lower), np.array(upper)
 
     def retract(self, delta: Array) -> Array:
         """The value vector that an increment of the free blocks leads to from the nominal values."""

@@ -10,7 +10,14 @@ from pydantic import model_validator
 from armcal.base.arrays import Array
 from armcal.base.domains import Rotation
 from armcal.base.parameters import ParameterBlock, scalar
-from armcal.base.quaternions import PRINTED, nearest_rotation, quaternion_of, rotation_matrix, rpy_matrices
+from armcal.base.quaternions import (
+    PRINTED,
+    nearest_rotation,
+    quaternion_of,
+    rotation_matrix,
+    rotation_rows,
+    rpy_matrices,
+)
 from armcal.base.se3 import Expression, Transform
 from armcal.base.settings import Angle3, Length3, Settings
 
@@ -20,12 +27,10 @@ NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
 def point_blocks(name: str, position: Sequence[float]) -> tuple[ParameterBlock, ...]:
-    """``name_x``, ``name_y``, ``name_z`` (m)."""
     return tuple(scalar(f"{name}_{axis}", "m", x, LENGTH_SCALE_M) for axis, x in zip("xyz", position, strict=True))
 
 
 def point_expression(name: str, values: Mapping[str, Expression]) -> Expression:
-    """The point (3x1, m) that the blocks of ``point_blocks`` stand for."""
     return ca.sparsify(ca.vertcat(*[values[f"{name}_{axis}"] for axis in "xyz"]))
 
 
@@ -46,12 +51,7 @@ def pose_transform(name: str, values: Mapping[str, Expression]) -> Transform:
 
 def rotation_of(quaternion: Expression) -> Expression:
     """The rotation matrix (3x3) of a unit quaternion (w, x, y, z). [Murray1994]"""
-    w, x, y, z = (quaternion[i] for i in range(4))
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
+    rows = rotation_rows(*(quaternion[i] for i in range(4)))
     return ca.sparsify(ca.vertcat(*[ca.horzcat(*row) for row in rows]))
 
 
@@ -107,7 +107,6 @@ class PoseSettings(Settings):
 
     @property
     def matrix(self) -> Array:
-        """The homogeneous matrix (4 x 4, m)."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation_matrix(np.array(self.unit_quaternion)), self.position
         return matrix

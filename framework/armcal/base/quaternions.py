@@ -1,6 +1,7 @@
 """Rotations as arrays of numbers: unit quaternions (w, x, y, z) and matrices. [Murray1994]"""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -47,14 +48,15 @@ def nearest_turn(matrix: Array) -> Array:
 
 
 def rotation_matrix(q: Array) -> Array:
-    """The rotation matrix (3x3) of a quaternion of any length."""
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+    return np.array(rotation_rows(*(q / np.linalg.norm(q))))
+
+
+def rotation_rows(w: Any, x: Any, y: Any, z: Any) -> tuple[tuple[Any, Any, Any], ...]:
+    """The rotation matrix of a unit quaternion, of numbers or expressions."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
 
 

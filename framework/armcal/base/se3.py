@@ -71,7 +71,6 @@ def column(method: Callable[..., Any], returned: Any, rows: int | None, expected
 
 
 def evaluated(expression: Expression) -> Array:
-    """The numbers of an expression without symbols, in its shape."""
     return np.asarray(ca.evalf(ca.densify(ca.SX(expression))).full())
 
 
@@ -100,7 +99,6 @@ def cos_sin(angle: Expression) -> tuple[Expression, Expression]:
 
 
 def rotation_about(axis: str, angle: Expression) -> Transform:
-    """A rotation (rad) about the x, y or z axis."""
     cosine, sine = cos_sin(angle)
     places, numbers = {  # column by column
         "x": (([0, 1, 2, 1, 2], [0, 1, 1, 2, 2]), (1, cosine, sine, -sine, cosine)),
@@ -116,7 +114,6 @@ def translation_along(axis: str, distance: Expression) -> Transform:
 
 
 def skew(vector: Expression) -> Expression:
-    """The 3x3 matrix of the cross product with ``vector``."""
     x, y, z = vector[0], vector[1], vector[2]
     zero = ca.SX(1, 1)
     return ca.vertcat(ca.horzcat(zero, -z, y), ca.horzcat(z, zero, -x), ca.horzcat(-y, x, zero))

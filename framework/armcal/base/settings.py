@@ -28,8 +28,6 @@ class Fault:
 
 @dataclass(frozen=True)
 class UnitOf:
-    """Marks a float, or a container of floats, as a physical quantity held in SI units."""
-
     dimension: str
 
     def __post_init__(self) -> None:
@@ -79,15 +77,12 @@ InputPath: TypeAlias = Annotated[Path, BeforeValidator(_resolve)]
 
 @dataclass(frozen=True)
 class Kind:
-    """What a field takes."""
-
     dimension: str | None = None  # of the quantity it holds; None: not a quantity
     takes_text: bool = False  # ordinary text is a value too (``Angle | Literal["off"]``)
     maps: bool = False  # the quantity may stand inside a mapping by name (``dict[str, Length]``)
 
 
 def kind_of(annotations: Iterable[Any]) -> Kind:
-    """What a field with these annotations and metadata takes, through unions and containers."""
     kind = Kind()
     for part in annotations:
         origin = get_origin(part)
@@ -150,24 +145,19 @@ def convert(name: str, value: Any, kind: Kind, unit: str) -> Any:
     if isinstance(value, Mapping) and kind.maps:
         return {key: convert(name, entry, kind, unit) for key, entry in value.items()}
     if isinstance(value, str):
-        return _read_text(name, value, kind)
+        if kind.takes_text and not _STARTS_A_NUMBER.match(value):
+            return value
+        try:
+            return parse_quantity(value, kind.dimension or "")
+        except ValueError as fault:
+            message = str(fault).removesuffix(".")
+            return Fault(f"{message}; or give the unit in the key, {accepted(name, kind.dimension or '')}.")
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
     try:
         return from_unit(value, unit)
     except OverflowError:
         return Fault("found a number that is too large, expected a finite one: correct it.")
-
-
-def _read_text(name: str, text: str, kind: Kind) -> Any:
-    dimension = kind.dimension or ""
-    if kind.takes_text and not _STARTS_A_NUMBER.match(text):
-        return text
-    try:
-        return parse_quantity(text, dimension)
-    except ValueError as fault:
-        message = str(fault).removesuffix(".")
-        return Fault(f"{message}; or give the unit in the key, {accepted(name, dimension)}.")
 
 
 _SI = "armcal_si"
@@ -191,7 +181,7 @@ def _as_config(value: Any) -> Any:
 
 
 def _make_scalars_strict(schema: Any) -> None:
-    """Set ``strict`` on every scalar of a core schema, passing over what is not schema."""
+    """Set ``strict`` on every scalar, passing over what is not schema."""
     if isinstance(schema, (list, tuple)):
         for part in schema:
             _make_scalars_strict(part)

@@ -1,7 +1,5 @@
 """Units at the edges, SI inside: which units a config or a data column may declare."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping
@@ -188,11 +186,7 @@ _SHORT = {"day": "d", "hour": "h", "minute": "min", "second": "s"}
 
 
 def amount_in_time(text: str) -> tuple[str, float]:
-    """The amount as written, and the time (s), of ``0.05 deg in 30 d``, ``0.1 mm in a week``, ``0.02 in 1 month``.
-
-    Raises:
-        ValueError: it is not written so.
-    """
+    """The amount as written, and the time (s), of ``0.05 deg in 30 d``, ``0.1 mm in a week``; else a ValueError."""
     match = _RATE.fullmatch(text)
     if match is not None:
         unit = match["unit"].lower()
@@ -211,8 +205,7 @@ def amount_in_time(text: str) -> tuple[str, float]:
 def parse_quantity(text: str, dimension: str) -> float:
     """The SI value of a number with its unit, ``"5 mm"`` or ``"9.81 m/s^2"``; without one if it is dimensionless.
 
-    Raises:
-        ValueError: not a number, no unit, a unit of another dimension, or too large; lists the accepted units.
+    A ValueError lists the accepted units.
     """
     if _DECIMAL_COMMA.match(text):
         raise ValueError(_expected(f"{text!r} has a decimal comma, write a point", dimension))
@@ -243,13 +236,11 @@ def _expected(text: str, dimension: str) -> str:
 
 
 def from_unit(value: _Number, unit_name: str) -> _Number:
-    """The SI value of a number or array in the named unit; ValueError for an unknown unit."""
     known = unit(unit_name)
     return value * known.numerator / known.denominator
 
 
 def to_unit(si_value: _Number, unit_name: str) -> _Number:
-    """The value in the named unit of an SI number or array; ValueError for an unknown unit."""
     known = unit(unit_name)
     return si_value * known.denominator / known.numerator
 

@@ -34,8 +34,7 @@ from armcal.errors import ConfigError, Location, PluginError
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import DeterminedBy
 from armcal.measure.groups import PairedMeasurement
-from armcal.measure.instrument import ArmsAlone
-from armcal.measure.measurement import Measurement
+from armcal.measure.measurement import ArmsAlone, Measurement
 from armcal.measure.reader import requested_channels
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem

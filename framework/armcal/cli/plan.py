@@ -19,8 +19,7 @@ from armcal.estimate.identifiability import Measure
 from armcal.estimate.simulation import TruthfulSimulator
 from armcal.estimate.start import carriers_of
 from armcal.io.plain_files import check_folder, write_over
-from armcal.measure.instrument import Rendering
-from armcal.measure.measurement import borrowed_names
+from armcal.measure.measurement import Rendering, borrowed_names
 from armcal.measure.tables import write_csv
 from armcal.problem.problem import Problem
 from armcal.report.document import Document, Section, Table

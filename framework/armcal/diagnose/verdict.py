@@ -33,7 +33,7 @@ from armcal.estimate.prediction import NewRecording
 from armcal.estimate.validation import Halves, pose_size, summarise
 from armcal.measure.measurement import Placed
 from armcal.planning.candidates import whitened_rows
-from armcal.planning.suggestion import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
+from armcal.planning.exchange import CANDIDATES, Suggestion, in_words, is_worth_measuring, suggest
 from armcal.plugins import PluginRegistry
 from armcal.problem.problem import Problem
 from armcal.problem.rigid_alignment import along, apart_from, tools, unseen_motions

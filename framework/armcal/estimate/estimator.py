@@ -1,7 +1,5 @@
 """Estimators and estimates: from a problem to values, and how sure they are."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Iterator, KeysView
 from dataclasses import dataclass
@@ -95,8 +93,6 @@ def spread(estimator: Estimator, executor: Executor | None) -> Estimator:
 
 @dataclass(frozen=True)
 class Interval95:
-    """A 95 % interval of one canonical entry."""
-
     lower: float
     upper: float
     bounds: tuple[str, ...] = ()  # the ends that are bounds of the entry itself: lower, upper
@@ -216,7 +212,7 @@ class Estimate:
 
 
 def interval(value: float, unconstrained: float, sd: float, lower: float, upper: float, quantile: float) -> Interval95:
-    """Of an entry between these bounds, by its value and where it would be without them; see ``Estimate.intervals``."""
+    """Of an entry, by its value and where it would be without bounds; see ``Estimate.intervals``."""
     low, high = value - quantile * sd, value + quantile * sd
     if not np.isfinite(sd):
         low, high = lower, upper
@@ -242,14 +238,10 @@ class Influence:
 def estimate(problem: Problem, solution: Solution, influence: Influence | None = None) -> Estimate:
     """Covariance, intervals and identifiability at a solution; without ``influence``, one of least squares.
 
-    The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a
-    model that is wrong by more than the noise the intervals widen accordingly. Priors weigh in the estimate as they
-    were stated against the declared noise, so its covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with
-    H = b J'J + P; s is the influence's spread and b its slope, 1 in least squares.
-    A parameter at a bound keeps its full covariance: the bound is not evidence.
-
-    Raises:
-        NotConvergedError: springs do not hold the arm in a record.
+    The declared noise is scaled to the residuals found (the a posteriori variance factor [Mikhail1976]): with a model
+    that is wrong by more than the noise the intervals widen. Priors weigh as they were stated against the declared
+    noise, so the covariance is the sandwich H^-1 (s^2 J'J + P) H^-1 with H = b J'J + P; s is the influence's spread and
+    b its slope, 1 in least squares. A parameter at a bound keeps its full covariance: the bound is not evidence.
     """
     problem.require_held(solution.values)
     parameters = problem.parameters
@@ -284,10 +276,9 @@ def estimate(problem: Problem, solution: Solution, influence: Influence | None =
 
 
 def degrees_of_freedom(problem: Problem, values: Array, slope: float = 1.0) -> float:
-    """Residual numbers less what a fit takes up of them, the trace of its hat matrix.
+    """Residual numbers less what a fit takes up of them, the trace of its hat matrix; ``slope`` is of an influence.
 
-    A parameter that its prior holds takes up nothing, so that it is not counted as spent. ``slope`` is that of an
-    influence.
+    A parameter that its prior holds takes up nothing, so that it is not counted as spent.
     """
     triangle = np.sqrt(slope) * factor_at_zero(problem, values)
     return problem.equations() - InverseInformation.of(triangle, problem.parameters).spent

@@ -4,22 +4,18 @@ Rank is judged on the whitened Jacobian with each column scaled by the typical s
 values and by QR with pivoting [Golub2013]; undetermined combinations are reduced to as few parameters each as
 possible.
 
-A minimal set of parameters: which to keep free, and what absorbs each of the others.
+A minimal set of parameters, which to keep free and what absorbs each of the others, is found by QR with column pivoting
+on the scaled Jacobian, block by block, preferred blocks first; the way in which base parameters are found numerically
+[Khalil2002].
 
-QR with column pivoting on the scaled Jacobian [Golub2013], block by block, preferred blocks first; the way in which
-base parameters are found numerically [Khalil2002].
+A combination is undetermined because no poses determine it, these poses do not, or only not at these values. A model is
+analytic, so its rank is the same almost everywhere; random poses at a point near the values at hand show it with
+probability one, and what is undetermined there is a gauge.
 
-Why a combination is undetermined: no poses determine it, these poses do not, or only not at these values.
-
-A model is analytic, so its rank is the same almost everywhere; random poses at a point near the values at hand show
-it with probability one, and what is undetermined there is a gauge.
-
-Of fixed parameters: those that the records would determine and that explain residuals. One after another, the one whose
-score is largest for its spread [Rao1948] is freed, to first order. What chance would find among so many is no gain:
-levels are divided by their number.
+Of fixed parameters, those are worth freeing that the records would determine and that explain residuals: one after
+another the one whose score is largest for its spread [Rao1948], to first order. What chance would find among so many is
+no gain: levels are divided by their number.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -27,7 +23,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from math import comb
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from scipy.linalg import qr
@@ -219,8 +215,6 @@ _LARGE_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the data determines of the free parameters."""
-
     names: tuple[str, ...]  # of the coordinates
     singular_values: Array  # of the scaled whitened Jacobian, largest first
     directions: Array  # right singular vectors, one a row
@@ -279,8 +273,7 @@ OF_PRIOR = 0.9  # Of its prior's standard deviation: a parameter that keeps more
 def determined_by(known: Identifiability, parameters: Parameters, deviations: Array) -> tuple[DeterminedBy, ...]:
     """What determines each free coordinate, of these standard deviations (n, SI) by data and priors together.
 
-    The data, unless it takes part in a combination that they do not determine (by more than 1e-6 of its typical
-    scale), or keeps 90 % of its prior's standard deviation.
+    The data, unless it takes part in a combination that they do not determine, or keeps 90 % of its prior's deviation.
     """
     information = parameters.prior_information()
     by_priors = np.linalg.norm(known.null, axis=0) >= _NEGLIGIBLE
@@ -290,13 +283,11 @@ def determined_by(known: Identifiability, parameters: Parameters, deviations: Ar
 
 
 def expected_sources(known: Identifiability, parameters: Parameters, triangle: Array) -> dict[str, DeterminedBy]:
-    """What will determine each free parameter, by name, if the noise is as declared; see ``analyse`` for R."""
     deviations = np.sqrt(np.diag(expected_covariance(triangle, parameters)))
     return dict(zip(known.names, determined_by(known, parameters, deviations), strict=True))
 
 
 def determined_in_words(sources: Mapping[str, DeterminedBy]) -> str:
-    """How many free parameters the data determine, and which others priors hold, or nothing."""
     names = {by: [name for name, own in sources.items() if own == by] for by in DETERMINED_BY}
     if len(names["data"]) == len(sources):
         return f"The data determines all {len(sources)} free parameters"
@@ -315,10 +306,7 @@ def measures_of(parameters: Parameters) -> tuple[Measure, ...]:
 def analyse(
     triangle: Array, scales: Array, names: tuple[str, ...], measures: Sequence[Measure] = ()
 ) -> Identifiability:
-    """Identifiability from R (m x n, m <= n) with R'R = J'J of the whitened residuals.
-
-    A combination is undetermined if it is by the singular values and by the QR decomposition.
-    """
+    """Identifiability from R (m x n, m <= n) with R'R = J'J: undetermined by singular values and by QR."""
     count = len(names)
     if not count:
         return Identifiability(names, np.zeros(0), np.zeros((0, 0)), 0, ())
@@ -345,8 +333,7 @@ class InverseInformation:
     spent: float
 
     @classmethod
-    def of(cls, triangle: Array, parameters: Parameters) -> InverseInformation:
-        """From R (m x n) with R'R = J'J of the whitened residuals."""
+    def of(cls, triangle: Array, parameters: Parameters) -> Self:
         scales = parameters.scales()
         prior = np.sqrt(parameters.prior_information()) * scales
         _, values, directions = np.linalg.svd(np.vstack([triangle * scales, np.diag(prior)]), full_matrices=False)
@@ -378,10 +365,7 @@ def correlated_pairs(
     above: float = CORRELATED,
     bound: Callable[[str, str], bool] | None = None,
 ) -> tuple[tuple[str, str, float], ...]:
-    """Pairs of parameters whose estimates correlate by more than ``above``, the strongest first.
-
-    Pairs that are ``bound`` are left out: see ``bound_together``.
-    """
+    """Pairs of parameters that correlate by more than ``above`` and are not ``bound``, the strongest first."""
     correlation = correlations(covariance)
     rows, columns = np.triu_indices(len(names), 1)
     pairs = [
@@ -405,7 +389,6 @@ def bound_together(parameters: Parameters) -> Callable[[str, str], bool]:
 
 
 def correlations(covariance: Array) -> Array:
-    """The correlation matrix; zero where a variance is not known."""
     deviation = np.sqrt(np.diag(covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.nan_to_num(covariance / np.outer(deviation, deviation)))
@@ -449,13 +432,8 @@ def minimal_set(
     """Choose blocks that determine all that the data determines, and no more.
 
     Free parameters of groups, sockets and clamps, are tried first: a configuration has them free without naming them.
-
-    Args:
-        triangle: R (m x n) with R'R = J'J of the whitened residuals by the coordinates of the free blocks.
-        parameters: whose free blocks are chosen from.
-        preferred: block names; those of the first group are tried first, then those of the second, and so on.
-        most: no more blocks than this.
-        most_uncertain: leave out, the most uncertain first, what stays uncertain by more than so many typical scales.
+    Of ``preferred`` names those of the first group are tried next, and so on; no more blocks than ``most``; what stays
+    uncertain by more than ``most_uncertain`` typical scales is left out, the most uncertain first.
     """
     columns = triangle * parameters.scales()
     places = parameters.coordinates_of
@@ -651,9 +629,8 @@ def _largest(matrix: Array) -> float:
 def scale_is_unseen(problem: Problem, values: Array, known: Identifiability) -> bool:
     """Whether some undetermined combination makes all tools' positions grow in proportion.
 
-    Contacts fit a smaller arm in a smaller world just as well. The tools decide, not the parameters: which numbers
-    take part in a growth differs from model to model. A growth may go along with a motion of everything, and with
-    another point of a tool being the one that is meant.
+    Contacts fit a smaller arm in a smaller world just as well. Which numbers take part in a growth differs from model
+    to model, so the tools decide; a motion of everything, and another point of a tool, may go along with it.
     """
     if not len(known.null):
         return False

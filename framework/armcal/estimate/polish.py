@@ -92,10 +92,7 @@ def descended(posed: PosedProblem, x: Array, most_steps: int, damping: float, en
 
 
 def bounded_step(model: NormalEquations, lower: Array, upper: Array) -> Array | None:
-    """The minimum of a quadratic model between bounds on the step, by an active-set method; None without a single one.
-
-    Steps that end on a bound end on it exactly.
-    """
+    """The minimum of a quadratic model between bounds, by an active set, exact on those it meets; None if many."""
     size = np.sqrt(np.maximum(np.diag(model.hessian), 1e-300))
     try:
         root = np.linalg.cholesky(model.hessian / np.outer(size, size)).T
@@ -188,10 +185,7 @@ def started(problem: Problem) -> Problem:
 
 
 def mislabelled(problem: Problem, dataset: Dataset) -> list[str]:
-    """Warnings of records that the arm, as it starts, has at the place of another group than they name.
-
-    Places are those of the middling record of each group; only groups that are places have them.
-    """
+    """Warnings of records that the arm, as it starts, has at the place of another group than they name."""
     warnings, plan = [], problem.blueprint
     starts = problem.nuisance_starts(problem.parameters.nominal()) if problem.parameters.nuisances else ()
     parts = zip(problem.kernels, plan.measurements.items(), problem.records, starts, strict=False)
@@ -244,10 +238,7 @@ def settled(problem: Problem, values: Array) -> Array:
 
 
 def of_unseen_groups(problem: Problem, values: Array) -> Problem | None:
-    """The problem about these values in which only groups are free that a fit did not see; None where there are none.
-
-    Records with weights of zero do not count.
-    """
+    """The problem about these values with only groups free that a fit did not see (weights of zero do not count)."""
     fitted = {block.name for block in problem.parameters.free}
     open_names = {block.name for block in problem.blueprint.parameters.free if block.nuisance} - fitted
     names = open_names & _present(problem)

@@ -46,8 +46,6 @@ _Parts = tuple[Array, Array, Array]
 
 @dataclass(frozen=True)
 class Spread:
-    """How residuals of one factor are expected to vary."""
-
     covariance: Array  # of each record's residual (N x n_r x n_r; m^2 or rad^2)
     freedom: float  # degrees of freedom of the noise found
 
@@ -56,11 +54,9 @@ class Spread:
 
     @cached_property
     def deviations(self) -> Array:
-        """Standard deviation of each residual number (n_r x N)."""
         return np.asarray(np.sqrt(np.einsum("nrr->rn", self.covariance)))
 
     def half_widths(self, level: float) -> Array:
-        """Half the width of the interval that covers a residual number with this probability (n_r x N)."""
         return self.deviations * quantile(level, self.freedom)
 
     def radius(self, level: float = RADIUS_LEVEL) -> Array:
@@ -82,8 +78,6 @@ def quantile(level: float, freedom: float | Array) -> Array:
 
 @dataclass(frozen=True)
 class KnownDrift:
-    """A drift as the records of a fit determine it."""
-
     states: Array  # the most likely ones (n_k x n_s x 1)
     slopes: Array  # of the states by the values found (n_k x n_s x n_v)
     covariance: Array  # of the states at each node (n_k x n_s x n_s)
@@ -100,8 +94,6 @@ class KnownDrift:
 
 @dataclass(frozen=True)
 class NewRecording:
-    """What the errors of one recording say of another one, where something drifts."""
-
     ratio: Array  # typical error in a new recording over that of each judged record (n)
     freedom: float  # degrees of freedom of the errors' mean square, as their records share a drift
     independent: float  # the same, if the records were independent
@@ -121,10 +113,7 @@ class Predictor:
         return raw if here is None or self.drift is None else here.taken_off(raw, self.drift.states)
 
     def spreads(self, problem: Problem, recording: Recording) -> tuple[Spread, ...]:
-        """Spread about predictions, one a factor: with the drift of the ``same`` recording, without in a ``new`` one.
-
-        In the same recording the records must be on the chain of those of the fit.
-        """
+        """With the drift of the ``same`` recording (records on the chain of its fit), or of a ``new`` one."""
         parts = self._parts(problem, recording)
         return tuple(Spread(noise + values + drift, self.freedom) for noise, values, drift in parts)
 

@@ -59,7 +59,6 @@ class Loss:
     dimension: int  # m, how many residual numbers a record has
 
     def weight(self, norms: Array) -> Array:
-        """rho'(t)/t, from 1 down."""
         if self.name == "huber":
             return np.minimum(1.0, self.constant / np.maximum(norms, self.constant))
         return np.asarray(1 / (1 + (norms / self.constant) ** 2))
@@ -82,7 +81,6 @@ class Loss:
 
 @lru_cache(maxsize=32)
 def tuned(name: LossName, dimension: int) -> Loss:
-    """A loss that keeps 95 % efficiency in so many dimensions."""
     low, high, grid = 1e-2, 100.0, norm_grid()
     for _ in range(60):
         middle = np.sqrt(low * high)
@@ -112,8 +110,6 @@ UNCONTROLLED = 1e-3  # Of a residual's variance: below this it would hardly show
 
 @dataclass(frozen=True)
 class Distances:
-    """Of all records, factor by factor."""
-
     studentised: tuple[Array, ...]  # lengths of residuals in their own deviations (N each); 0 where nothing controls it
     limits: tuple[float, ...]  # the length that the largest of all stays below in 99 % of experiments without outliers
     scales: tuple[float, ...]  # residuals in units of their noise, by their median: few outliers hardly matter
@@ -161,10 +157,8 @@ def studentised_distances(problem: Problem, values: Array, weights: Sequence[Arr
 
 
 def limit_of(rows: int, freedom: float, tests: int) -> float:
-    """What the longest of so many residuals, of ``rows`` numbers each, stays below in 99 % of experiments.
-
-    They are scaled by their median, and have ``freedom`` numbers left beside what the fit took up.
-    """
+    """What the longest of ``tests`` residuals, of ``rows`` numbers each, stays below in 99 % of experiments."""
+    # They are scaled by their median, which is worth fewer numbers than what the fit left.
     squares = fdtri(min(rows, INDEPENDENT), max(1.0, EFFICIENCY_OF_MEDIAN * freedom), 1 - LEVEL / max(1, tests))
     return float(np.sqrt(rows * squares))
 
@@ -209,8 +203,6 @@ Weights = tuple[Array, ...]
 
 @dataclass(frozen=True)
 class RobustFit:
-    """Where reweighting or selecting came to rest."""
-
     solution: Solution  # the solver's, with all rounds counted; converged only if the weights settled too
     weights: Weights  # of each record, factor by factor (N each), from 0 to 1
     scales: tuple[float, ...]  # residuals in units of their noise, one a factor
@@ -227,18 +219,13 @@ def ones(problem: Problem) -> Weights:
 
 
 def norms(problem: Problem, values: Array, weights: Weights) -> Weights:
-    """Norm of each record's whitened residual in a fit with these weights, factor by factor (N each)."""
     return tuple(np.linalg.norm(r, axis=0) for r in remaining(problem, values, weights))
 
 
 def scales_of(problem: Problem, lengths: Weights, freedom: float) -> tuple[float, ...]:
-    """Each factor's median norm over that of Gaussian noise, with what the fit took up (all but ``freedom``) added.
-
-    Half the records may be wrong without it being far off. With less than one degree of freedom the declared noise is
-    believed.
-    """
+    """Each factor's median norm over that of Gaussian noise, with what the fit took up (all but ``freedom``) added."""
     count = problem.equations()
-    if freedom < 1:
+    if freedom < 1:  # the declared noise is believed
         return (1.0,) * len(problem.records)
     scales: list[float] = []
     for kernel, record, length in zip(problem.kernels, problem.records, lengths, strict=True):
@@ -318,7 +305,7 @@ def _noted(fit: RobustFit, status: str, warning: str = "") -> RobustFit:
 def influence(problem: Problem, fit: RobustFit, name: LossName, trusted: Weights) -> Influence:
     """How residuals act under a loss, with Huber's correction for few records [Huber1981].
 
-    The noise scale is the root mean square over the trusted records (1, else 0; N each).
+    The noise scale is the root mean square over the ``trusted`` records (1, else 0; N each).
     """
     lengths, count = norms(problem, fit.solution.values, fit.weights), problem.equations()
     spread = slope = squared = noise = 0.0
@@ -337,7 +324,6 @@ def influence(problem: Problem, fit: RobustFit, name: LossName, trusted: Weights
 
 
 def _selection(beyond: Weights, most: float) -> tuple[Weights, str]:
-    """Weights 0 for what is set aside, 1 for the rest; and a warning if there would be more."""
     every = np.concatenate(beyond)
     count, allowed = int(np.sum(every > 1)), int(most * len(every))
     if count <= allowed:
@@ -366,7 +352,6 @@ def _continued(before: Solution, problem: Problem, estimator: Estimator) -> Solu
 
 
 def _at_rest(problem: Problem, values: Array) -> bool:
-    """Whether the best step within the bounds is shorter than a millionth of a standard deviation."""
     posed = PosedProblem(problem)
     (lower, upper), x = posed.bounds(), posed.x(values)
     try:
@@ -406,8 +391,6 @@ class NoiseSettings(Settings):
 
 @dataclass(frozen=True)
 class Suspect:
-    """A record farther from the fit than noise alone takes any record in 99 % of experiments."""
-
     record: int  # its place among the records of the fit
     measurement: str  # whose residual it is
     distance: float  # length of its residual in its own standard deviations, robustly scaled
@@ -417,8 +400,6 @@ class Suspect:
 
 @dataclass(frozen=True)
 class WeighedFit:
-    """A fit, and how its records weighed."""
-
     solution: Solution  # the solver's
     estimate: Estimate  # values and how sure they are
     problem: Problem  # of its records, with the whitening used; set-aside ones have weight zero
@@ -436,7 +417,6 @@ class WeighedFit:
 
     @property
     def kept(self) -> Array:
-        """Whether each record took part with some measurement (N)."""
         return np.asarray(np.any(np.array(self.weights) > 0, axis=0))
 
 
@@ -487,10 +467,7 @@ class Weighing:
     def _weighed(
         self, problem: Problem, robust: RobustFit, progress: Progress
     ) -> tuple[RobustFit, Problem, VarianceComponents | None]:
-        """The fit, its records whitened, and components: these and values in turn, until the components rest.
-
-        Begins with a fit by the declared noise. Suspects are no evidence of the variances.
-        """
+        """The fit, its records whitened, and components, in turn until they rest. Suspects are no evidence."""
         axes, whitened, before = self.settings.axes, problem, None
         for number in range(MOST_ESTIMATES if self.settings.estimate else 0):
             if not robust.solution.verdict.converged:

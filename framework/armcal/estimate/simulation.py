@@ -50,12 +50,15 @@ class TruthfulSimulator(Protocol):
         """The request with the truth for nominal values, and the records with the commands at which the arm stood."""
 
 
+def _fixed(request: SimulationRequest, dataset: Dataset) -> Problem:
+    parts = (request.arms, request.measurements, request.parameters.with_free(()), request.environment, dataset)
+    return Problem.build(*parts, evaluator="interpreted")
+
+
 def measured_without_noise(request: SimulationRequest, commands: Dataset) -> Mapping[str, Array]:
     """What every instrument would read at these commands if the parameters' nominal values were the truth (SI)."""
-    fixed = request.parameters.with_free(())
-    parts = (request.arms, request.measurements, fixed, request.environment, commands)
-    problem = Problem.build(*parts, evaluator="interpreted")
-    return problem.by_channel(problem.predict(fixed.nominal()))
+    problem = _fixed(request, commands)
+    return problem.by_channel(problem.predict(problem.parameters.nominal()))
 
 
 def measured_with_noise(
@@ -70,17 +73,14 @@ def measured_with_noise(
     ``request`` has the truth for nominal values, ``exact`` what every instrument would read without noise, by channel;
     ``length_noise`` (m) is that of all residuals that are lengths, in place of the declared one.
     """
-    fixed, read = request.parameters.with_free(()), with_channels(commands, exact)
-    parts = (request.arms, request.measurements, fixed, request.environment, read)
-    problem = Problem.build(*parts, evaluator="interpreted")
-    noise = []
+    problem, noise = _fixed(request, with_channels(commands, exact)), []
     for kernel in problem.kernels:
         factor = kernel.factor
         declared = zip(factor.noise, factor.dimensions, strict=True)
         sizes = [sd if length_noise is None or kind != "length" else length_noise for sd, kind in declared]
         rows = [random.normal(0.0, size, len(commands)) for size in sizes if factor.output_channels]
         noise.append(np.array(rows) if rows else np.zeros((len(sizes), len(commands))))
-    read_off = disturbed(problem, fixed.nominal(), noise)
+    read_off = disturbed(problem, problem.parameters.nominal(), noise)
     measurements = {
         channel: factor_records.record[kernel.factor.channels.index(channel), : factor_records.count]
         for kernel, factor_records in zip(problem.kernels, read_off.records, strict=True)

@@ -27,8 +27,7 @@ from armcal.base.parameters import ParameterBlock, Parameters
 from armcal.base.units import digits
 from armcal.errors import NotConvergedError, ProblemError
 from armcal.estimate.polish import descended
-from armcal.measure.instrument import Proposing, Reading
-from armcal.measure.measurement import Carried, borrowed_names
+from armcal.measure.measurement import Carried, Proposing, Reading, borrowed_names
 from armcal.problem.problem import PosedProblem, Problem
 from armcal.problem.rigid_alignment import (
     Alignment,
@@ -316,34 +315,31 @@ def with_proposals(start: Start, dataset: Dataset) -> Start:
     measurements = [start.problem.blueprint.measurements[kernel.factor.name] for kernel in start.problem.kernels]
     lenders_first = sorted(enumerate(measurements), key=lambda numbered: bool(borrowed_names(numbered[1])))
     for number, measurement in lenders_first:
-        if isinstance(measurement, Proposing):
-            start = _with_proposal(start, dataset, number, measurement)
+        if not isinstance(measurement, Proposing):
+            continue
+        problem, name = start.problem, start.problem.kernels[number].factor.name
+        parameters, nominal = problem.parameters, problem.parameters.nominal()
+        before = start.vectors[0] if start.vectors else nominal
+        own = _own(problem, name)
+        proposal = measurement.propose(_reading(problem, nominal, before, dataset, number))
+        if any(own[local].prior_sd is None for local in proposal.undetermined):
+            hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
+            raise ProblemError(f"{name}: {proposal.open}", where=dataset.where(), hint=hint)
+        if not proposal.values:
+            continue
+        vector, moved = before.copy(), nominal.copy()
+        for local, value in proposal.values.items():
+            place = parameters.entries_of(own[local].name)
+            vector[place] = value
+            if own[local].prior_sd is None:
+                moved[place] = value
+        configured, left = (_typical(problem, values, number) for values in (nominal, vector))
+        if left * BETTER <= configured:
+            names = (*start.names, *(own[local].name for local in proposal.values))
+            placed, vectors = problem.with_parameters(parameters.with_nominal(moved)), (vector, *start.vectors)
+            elsewhere = replace(start, problem=placed, names=names, vectors=vectors)
+            start = replace(elsewhere, configured=configured, left=left, taken=True)
     return start
-
-
-def _with_proposal(start: Start, dataset: Dataset, number: int, measurement: Proposing) -> Start:
-    problem, name = start.problem, start.problem.kernels[number].factor.name
-    parameters, nominal = problem.parameters, problem.parameters.nominal()
-    before = start.vectors[0] if start.vectors else nominal
-    own = _own(problem, name)
-    proposal = measurement.propose(_reading(problem, nominal, before, dataset, number))
-    if any(own[local].prior_sd is None for local in proposal.undetermined):
-        hint = f"{proposal.close} Or give priors, or hold {', '.join(proposal.undetermined)}."
-        raise ProblemError(f"{name}: {proposal.open}", where=dataset.where(), hint=hint)
-    if not proposal.values:
-        return start
-    vector, moved = before.copy(), nominal.copy()
-    for local, value in proposal.values.items():
-        place = parameters.entries_of(own[local].name)
-        vector[place] = value
-        if own[local].prior_sd is None:
-            moved[place] = value
-    configured, left = (_typical(problem, values, number) for values in (nominal, vector))
-    if left * BETTER > configured:
-        return start
-    names = (*start.names, *(own[local].name for local in proposal.values))
-    placed, vectors = problem.with_parameters(parameters.with_nominal(moved)), (vector, *start.vectors)
-    return replace(start, problem=placed, names=names, vectors=vectors, configured=configured, left=left, taken=True)
 
 
 def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
@@ -352,7 +348,7 @@ def _own(problem: Problem, name: str) -> dict[str, ParameterBlock]:
 
 
 def _reading(problem: Problem, own_values: Array, values: Array, dataset: Dataset, number: int) -> Reading:
-    """What a measurement read; arm and borrowed parameters are at ``values``, its own at ``own_values``."""
+    """Arm and borrowed parameters are at ``values``, its own at ``own_values``."""
     name, parameters = problem.kernels[number].factor.name, problem.parameters
     own, lent = _own(problem, name), borrowed_names(problem.blueprint.measurements[name])
     borrowed = {local: values[parameters.entries_of(full)] for local, full in lent.items()}
@@ -381,7 +377,6 @@ def carriers_of(problem: Problem, values: Array, dataset: Dataset, number: int) 
 
 
 def _frame(problem: Problem, values: Array, dataset: Dataset, of: str, name: str) -> Array:
-    """A frame of a still arm in each record (base_T_frame, N x 4 x 4, m)."""
     arm, parameters = problem.blueprint.arms[of], problem.parameters
     stated = {name: ca.SX(values[parameters.entries_of(name)]) for name in parameters.names}
     chain, symbols = arm.chain(stated), ca.SX.sym("commands", len(arm.commanded))

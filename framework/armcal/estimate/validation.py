@@ -5,8 +5,6 @@ another [Politis1992]; blocks of one record draw independent ones. What is wrong
 that the spread counts it.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import time
@@ -19,7 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from pydantic import Field
 
-from armcal.base.arrays import Array, Indices
+from armcal.base.arrays import Array, Indices, Mask
 from armcal.base.settings import Settings
 from armcal.base.units import ERROR_NAMES, ERROR_UNITS
 from armcal.errors import NotConvergedError, ProblemError
@@ -40,9 +38,7 @@ _HALVINGS, _FEWEST_HALVED = 6, 10
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Errors over some records, all in the unit of the errors given; None where there are no, or too few, records."""
-
-    mean: float | None
+    mean: float | None  # None where there are no, or too few, records
     rms: float | None
     p95: float | None
     max: float | None
@@ -72,19 +68,15 @@ def summarise(errors: Array) -> ErrorSummary:
 def record_errors(problem: Problem, values: Array, training: Problem | None = None) -> Array:
     """How far each record's measurement lies from the prediction; root mean square over several measurements (N).
 
-    In m, angles left out; of images, or angles alone, in their unit (``error_unit``). Groups that the problem holds,
-    as those that no training record touched, are fitted to these records first: what is left is how far the records
-    of a group disagree. ``training`` has the records that determine how far drifting parameters had drifted; without
-    them they are at rest.
+    In m, angles left out; of images, or angles alone, in their unit (``error_unit``). Groups that the problem holds are
+    fitted to these records first. ``training`` has the records that determine how far drifting parameters had drifted;
+    without them they are at rest.
     """
     return errors_and_turns(problem, values, training)[0]
 
 
 def errors_and_turns(problem: Problem, values: Array, training: Problem | None = None) -> tuple[Array, Array | None]:
-    """As ``record_errors``, and errors of orientations (rad, N): the angle of the turn that is left.
-
-    None where no orientation is measured beside lengths.
-    """
+    """As ``record_errors``, and errors of orientations (rad, N), None where none is measured beside lengths."""
     values = settled(problem, values)
     raw = problem.residuals(values) if training is None else problem.residuals_beside(training, values)
     own = tuple(zip(problem.kernels, problem.records, raw, strict=True))
@@ -97,10 +89,7 @@ def measures_turns(problem: Problem) -> bool:
 
 
 def _sizes(own: Sequence[tuple[Kernel, FactorRecords, Array]], counted: str) -> Array:
-    """Of each record's residual, the entries of one dimension; root mean square over its measurements (N).
-
-    Of a measurement of many points, over those that the record has.
-    """
+    """The entries of one dimension of each record, root mean square over measurements and the points it has (N)."""
     squares, count = np.zeros((2, own[0][1].count))
     for kernel, record, residual in own:
         rows = np.array([dimension == counted for dimension in kernel.factor.dimensions], dtype=bool)
@@ -150,12 +139,14 @@ def hold_out(count: int, fraction: float, seed: int, poses: Indices | None = Non
     """A random split; the same for the same count and seed. Records of one pose (numbers, N) stay together."""
     poses, number = _poses(count, poses)
     order = np.random.default_rng(seed).permutation(number)
-    held = np.isin(poses, order[: round(fraction * number)])
-    return Split(np.flatnonzero(~held).astype(np.intp), np.flatnonzero(held).astype(np.intp))
+    return _split(~np.isin(poses, order[: round(fraction * number)]))
+
+
+def _split(trains: Mask) -> Split:
+    return Split(np.flatnonzero(trains).astype(np.intp), np.flatnonzero(~trains).astype(np.intp))
 
 
 def _poses(count: int, poses: Indices | None) -> tuple[Indices, int]:
-    """The number of each record's pose, and how many there are; each record its own where nothing is known."""
     poses = np.arange(count, dtype=np.intp) if poses is None else np.unique(poses, return_inverse=True)[1]
     return poses, int(poses.max(initial=-1)) + 1
 
@@ -168,8 +159,7 @@ def split_by_id(ids: Sequence[str], train_ids: Sequence[str]) -> Split:
             f"{len(missing)} of {len(training)} training ids are not in the data, the first: {missing[0]}.",
             hint="Check that the list belongs to this dataset; records set aside on reading cannot train.",
         )
-    inside = np.array([record in training for record in ids], dtype=bool)
-    return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
+    return _split(np.array([record in training for record in ids], dtype=bool))
 
 
 def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
@@ -179,8 +169,7 @@ def split_by_label(labels: Sequence[str], train: Sequence[str]) -> Split:
             f"no record belongs to {missing[0]!r}; there are {', '.join(sorted(set(labels)))}.",
             hint="Correct validation.train_groups.",
         )
-    inside = np.array([label in set(train) for label in labels], dtype=bool)
-    return Split(np.flatnonzero(inside), np.flatnonzero(~inside))
+    return _split(np.array([label in set(train) for label in labels], dtype=bool))
 
 
 def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> tuple[Split, ...]:
@@ -192,8 +181,7 @@ def folds(count: int, number: int, seed: int, poses: Indices | None = None) -> t
             hint="Take at least 2 folds, and no more than there are records of different poses.",
         )
     order = np.random.default_rng(seed).permutation(different)
-    judging = [np.isin(poses, part) for part in np.array_split(order, number)]
-    return tuple(Split(np.flatnonzero(~held).astype(np.intp), np.flatnonzero(held).astype(np.intp)) for held in judging)
+    return tuple(_split(~np.isin(poses, part)) for part in np.array_split(order, number))
 
 
 @dataclass(frozen=True)
@@ -233,7 +221,7 @@ class JudgedFit:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Errors of each record, judged by the fold that did not train on it (nan if that fold did not converge)."""
+    """Errors of each record, judged by the fold that did not train on it (nan if that did not converge)."""
 
     errors: Array
     at_rest: Array  # if nothing is known of a drift
@@ -432,10 +420,7 @@ def bootstrap(
     progress: Progress = no_progress,
     poses: Indices | None = None,
 ) -> Bootstrap:
-    """Refit to resamples of the records (in recorded order) of an estimate; the same seed gives the same refits.
-
-    Records of one pose (``poses``, numbers from 0) are drawn together.
-    """
+    """Refit to resamples of the records (in recorded order), those of one pose (``poses``, from 0) drawn together."""
     count, random = problem.count, np.random.default_rng(settings.seed)
     poses = np.arange(count) if poses is None else poses
     if settings.blocks == "auto":  # the longest that any residual component asks for

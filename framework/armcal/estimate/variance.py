@@ -12,11 +12,10 @@ D = S^-1 and P = D - D J (J' D J + prior)^-1 J' D [Patterson1971]:
     slope_c = 1/2 (y' P V_c P y - tr P V_c),    average information_cd = 1/2 y' P V_c P V_d P y    [Gilmour1995]
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from scipy.special import ndtri
@@ -49,9 +48,7 @@ class Term:
 
 @dataclass(frozen=True)
 class _Local:
-    """Log likelihood, its slope and the average information at some thetas."""
-
-    value: float
+    value: float  # log likelihood at some thetas
     slope: Array
     information: Array
 
@@ -82,30 +79,19 @@ def maximise(terms: Sequence[Term], prior: Array, floored: Array) -> tuple[Array
         if step is None:
             break
         length = max(float(step @ here.information @ step), 0.0) ** 0.5
-        moved = _raised(terms, prior, theta, step, here)
-        if moved is None:
+        for halving in range(_MOST_HALVINGS):  # along the step as far as the likelihood does not fall
+            with suppress(np.linalg.LinAlgError):
+                there = _evaluate(terms, prior, theta + step * 0.5**halving)
+                if there.value >= here.value:
+                    break
+        else:
             break
-        theta, here = moved
+        theta, here = theta + step * 0.5**halving, there
         if length < AT_REST:
             break
     scale = np.sqrt(np.maximum(np.diag(here.information), 1e-300))
     covariance = np.linalg.pinv(here.information / np.outer(scale, scale), rcond=1e-10, hermitian=True)
     return theta, covariance / np.outer(scale, scale)
-
-
-def _raised(
-    terms: Sequence[Term], prior: Array, theta: Array, step: Array, here: _Local
-) -> tuple[Array, _Local] | None:
-    """Along a step as far as the likelihood does not fall; None if it falls everywhere."""
-    for halving in range(_MOST_HALVINGS):
-        there = theta + step * 0.5**halving
-        try:
-            local = _evaluate(terms, prior, there)
-        except np.linalg.LinAlgError:
-            continue
-        if local.value >= here.value:
-            return there, local
-    return None
 
 
 def _evaluate(terms: Sequence[Term], prior: Array, theta: Array) -> _Local:
@@ -176,7 +162,7 @@ class VarianceComponents:
     def mostly_joints(self) -> bool:
         return self.share("joint") > 0.5
 
-    def close_to(self, other: VarianceComponents) -> bool:
+    def close_to(self, other: Self) -> bool:
         if [c.name for c in self.components] != [c.name for c in other.components]:
             return False
         return all(
@@ -222,7 +208,6 @@ def estimate_components(
 
 
 def apply_components(problem: Problem, values: Array, variance_components: VarianceComponents, axes: Axes) -> Problem:
-    """The problem of records whitened by estimated variances."""
     sources = _sources(problem, values, axes)
     variance = {c.name: c.sd**2 for c in variance_components.components}
     result = []
@@ -245,7 +230,6 @@ class _Source:
 
 
 def _sources(problem: Problem, values: Array, axes: Axes) -> list[_Source]:
-    """Instruments, or their axes, then joints."""
     pairs = list(zip(problem.kernels, problem.records, strict=True))
     nothing = [np.zeros((kernel.factor.rows,) * 2 + (record.count,)) for kernel, record in pairs]
     sources = []

@@ -167,7 +167,6 @@ def read_as(
 
 
 def check_dataset(dataset: Dataset, layout: Layout) -> Dataset:
-    """All checks: those that refuse or set aside, then warnings."""
     dataset = warn_kelvin(warn_small_degrees(check_records(dataset, layout), layout), layout)
     return warn_repeated_poses(dataset, layout)
 
@@ -275,7 +274,7 @@ def _with_deviations(dataset: Dataset, layout: Layout, channel: str) -> Dataset:
 
 
 def with_absent(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> Dataset:
-    """The dataset with all that measurements require: what its source cannot have is missing in all records."""
+    """What measurements require and the source cannot have is missing in all records."""
     absent = [w.channel for w in requested_channels if w.required and w.parts and not dataset.has(w.channel)]
     none = np.full(len(dataset), np.nan)
     return replace(dataset, channels={**dataset.channels, **dict.fromkeys(absent, none)}) if absent else dataset
@@ -357,7 +356,6 @@ def warn_kelvin(dataset: Dataset, layout: Layout) -> Dataset:
 
 
 def refuse_joint_units(dataset: Dataset, layout: Layout) -> None:
-    """Refuse radians beyond one turn, or degrees beyond two, of revolute joints."""
     for channel in layout.revolute if len(dataset) else ():
         values, unit, column = _known(dataset, channel), layout.units.get(channel, "rad"), layout.column(channel)
         first = int(np.argmax(np.abs(values)))
@@ -471,7 +469,6 @@ def set_aside_zeros(dataset: Dataset, layout: Layout) -> Dataset:
 
 
 def set_aside_duplicates(dataset: Dataset, layout: Layout) -> Dataset:
-    """Set aside copies: records that agree with an earlier one in everything but id, time and temperature."""
     if not layout.measured or dataset.has(CYCLE):  # poses to predict may repeat, and visits that are numbered
         return dataset
     alike = _first_alike(dataset, [name for name in dataset.channels if name not in _VARIES_AT_REST])
@@ -535,7 +532,6 @@ def warned(dataset: Dataset, text: str) -> Dataset:
 
 
 def require_conditions(dataset: Dataset, requested_channels: Sequence[RequestedChannel]) -> None:
-    """Refuse records without a column that an effect reads, whatever reader they come from."""
     for channel in requested_channels:
         if channel.effects and channel.required and not dataset.has(channel.channel):
             raise DataError(
@@ -592,7 +588,6 @@ def own_limits(arm: Arm, parameters: Parameters) -> dict[str, Limits]:
 
 
 def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm], parameters: Parameters) -> Dataset:
-    """The dataset, with warnings of all joints that were commanded beyond their limits, or their pulse tables."""
     of_limits, of_tables = list[str](), list[str]()
     for name, arm in arms.items():
         if not len(dataset) or not all(map(dataset.has, arm.command_channels)):
@@ -617,7 +612,6 @@ def warn_beyond_limits(dataset: Dataset, arms: Mapping[str, Arm], parameters: Pa
 
 
 def _beyond(what: str, values: Array, ends: Limits, tolerance: float, dimension: str) -> list[str]:
-    """A sentence of values (rad or m) beyond ends by more than a tolerance; none where none are."""
     over = np.maximum(ends[0] - values, values - ends[1])  # below zero inside
     over = np.nan_to_num(over, nan=-np.inf, neginf=-np.inf)
     if not (count := int(np.sum(over > tolerance))):

@@ -72,8 +72,6 @@ _FORBIDDEN = frozenset("[]*?\"'")
 
 @dataclass(frozen=True)
 class OwnedTie:
-    """A tie with the full names of the parameters it holds together."""
-
     names: tuple[Mapping[str, str], Mapping[str, str]]  # of each group's parameters, local to full
     tie: Tie
 
@@ -134,10 +132,7 @@ def record_keys(dataset: Dataset, measurement: GroupedMeasurement) -> tuple[str,
 
 
 def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, groups: Groups) -> Indices | None:
-    """Of each record the place of its group (N); -1 where it has none.
-
-    None if the measurement has no groups, or none that the records could belong to: no group is known, or no label.
-    """
+    """Of each record the place of its group (N; -1 for none); None without groups, known ones, or their labels."""
     if not isinstance(measurement, GroupedMeasurement):
         return None
     known = groups.get(owner_of(instance, measurement), ())
@@ -148,7 +143,6 @@ def group_numbers(dataset: Dataset, instance: str, measurement: Measurement, gro
 
 
 def refuse_lost(dataset: Dataset, measurements: Mapping[str, Measurement], lost: Mask) -> None:
-    """Refuse records that belong to no measurement, for want of a group."""
     if not lost.any():
         return
     if not measurements:

@@ -10,8 +10,7 @@ from armcal.arm.effects import JOINT_RATE, joint_rate
 from armcal.base.dataset import Dataset
 from armcal.base.units import DIMENSIONLESS, units_of
 from armcal.io.parallel import Report, unreported
-from armcal.measure.instrument import PointMeasurement
-from armcal.measure.measurement import Measurement, noise_channels
+from armcal.measure.measurement import Measurement, PointMeasurement, noise_channels
 
 
 @dataclass(frozen=True)

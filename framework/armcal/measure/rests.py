@@ -1,12 +1,10 @@
 """Still moments of a continuous log: stretches in which no joint moves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -131,7 +129,6 @@ def _largest_step(points: Array, spread: float) -> float:
 
 
 def _of_mean(residuals: Array) -> Array:
-    """The deviation of the mean of each column (N x k), whose residuals may be correlated in time."""
     count = len(residuals)
     squares = (residuals**2).sum(axis=0)
     lagged = (residuals[1:] * residuals[:-1]).sum(axis=0)
@@ -155,20 +152,17 @@ class StillSettings(Settings):
     spread: Annotated[Angle, Field(gt=0)] = _SPREAD_RAD
 
     @model_validator(mode="after")
-    def _one_length(self) -> StillSettings:
+    def _one_length(self) -> Self:
         if (self.window is None) == (self.samples is None):
             raise ValueError("expected either window_s or samples: how long the arm stands still")
         return self
 
 
 def rests(joints: Array, labels: Sequence[Sequence[str]], time: Array | None, settings: StillSettings) -> list[slice]:
-    """All stretches long enough in which no joint moves, in order.
+    """All stretches long enough in which no joint (joints x N; rad) moves, in order.
 
-    Args:
-        joints: joint displacements (joints x N; rad).
-        labels: text columns (N each); a rest ends where one changes.
-        time: of each row (N, s); needed for a window in seconds. A rest ends where it jumps back or by a window.
-        settings: what still means.
+    A rest ends where one of the text columns ``labels`` (N each) changes, and where ``time`` (N, s; needed for a window
+    in seconds) jumps back or by a window.
     """
     breaks = breaks_of(joints, labels, time, settings)
     edges = [0, *np.flatnonzero(breaks).tolist(), joints.shape[1]]

@@ -104,8 +104,6 @@ Number = Callable[[int, str, str], float]
 
 @dataclass(frozen=True)
 class Columns:
-    """What was read of a table."""
-
     lines: tuple[int, ...]  # of each row
     numbers: tuple[Array, ...]  # of each number column; NaN where a cell is empty
     texts: tuple[tuple[str, ...], ...]  # of each text column
@@ -122,7 +120,6 @@ class Table:
 
     @property
     def sha256(self) -> str:
-        """Of the file, once all rows were read."""
         return self._digest.hexdigest()
 
     def columns(
@@ -136,11 +133,7 @@ class Table:
     ) -> Columns:
         """Columns by their places from 0, those of numbers with their names.
 
-        Args:
-            numbers, texts: which.
-            has_header: whether the first row is one; else it is read too.
-            number: reads a cell that is no plain number; by default ``read_cell``.
-            plain: whether a cell that Python reads as a number is that number.
+        ``number`` reads a cell that is no plain number, by default ``read_cell``, and any cell unless ``plain``.
         """
         rows, width = self.rest if has_header else chain([self.first], self.rest), len(self.first[1])
 
@@ -182,7 +175,6 @@ class LineTable:
         return cls(source, delimiter, tuple(_split(text, source, line, delimiter)))
 
     def row(self, text: str, line: int) -> list[str]:
-        """The cells of a further line that is not blank."""
         cells = _split(text, self.source, line, self.delimiter)
         if len(cells) != len(self.header):
             _refuse_ragged(self.source, line, cells, len(self.header), True)
@@ -225,13 +217,9 @@ def open_table(
 ) -> Iterator[Table]:
     """A file as a table; a DataError, also while its rows are read, if it is empty or no text.
 
-    Args:
-        path: of the file.
-        what: it should be, with its article.
-        delimiter: between cells; ``auto`` for the likeliest in the first row, ``BLANKS`` for any blanks.
-        most: bytes that it may have.
-        empty: what to do if it is empty.
-        content: of the file, where it was read already.
+    ``what`` it should be (with its article) and what to do if it is ``empty`` are for messages. The ``delimiter`` may
+    be ``auto``, the likeliest in the first row, or ``BLANKS``; ``most`` are bytes; ``content`` is given where it was
+    read already.
     """
     digest = hashlib.sha256()
     try:
@@ -246,7 +234,6 @@ def open_table(
 
 
 def _text_lines(file: BinaryIO, path: Path, digest: "hashlib._Hash") -> Iterator[str]:
-    """The file as text, each line checked as it comes by; all its bytes go into ``digest``."""
     offset = 0
     for number, raw in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), start=1):
         digest.update(raw)
@@ -289,7 +276,6 @@ _ID_HEADER = "Give a header pose_id and an id a line."
 
 
 def read_ids(path: Path) -> tuple[str, ...]:
-    """The ids in a file, in its order."""
     with open_table(path, "a list of ids", most=MAX_ID_LIST_BYTES, empty=_ID_HEADER) as table:
         header = [cell.strip().lower() for cell in table.first[1]]
         column = next((header.index(name) for name in ID_NAMES if name in header), None)
@@ -316,8 +302,6 @@ class Column:
 
 @dataclass(frozen=True)
 class Header:
-    """The columns of a source."""
-
     source: str
     line: int | None  # the line that names them; none where every record names its own
     columns: tuple[Column, ...]
@@ -333,8 +317,6 @@ class Header:
 
 @dataclass(frozen=True)
 class Plan:
-    """Which column is what."""
-
     channels: Mapping[str, tuple[Column, str]]  # with the unit
     record_id: Column | None
     extra: tuple[Column, ...]
@@ -430,7 +412,6 @@ def spellings(w: RequestedChannel) -> dict[str, str]:
 
 
 def _refuse_unit(header: Header, w: RequestedChannel, unused: Mapping[str, Column]) -> None:
-    """A column that would be the channel's if it had a unit of its dimension."""
     for name in w.columns:
         hint = f"Write {' or '.join(spellings(replace(w, columns=(name,))))}."
         if name in unused:
@@ -474,23 +455,11 @@ def write_csv(
 ) -> None:
     """Write all records: ``pose_id``, the channels in the order of ``requested_channels``, then the extra columns.
 
-    The file appears whole or not at all; one that is there already is replaced, but no link and no device. Numbers are
-    written in full, so that reading them back gives the same SI values within one unit in the last place.
-
-    Args:
-        path: where to; its folder must exist.
-        dataset: SI values.
-        requested_channels: what the columns of each channel may be called; the shortest name that only one has is used.
-        units: of a column by its dimension; by default deg, mm, g, and otherwise the SI unit.
+    The file appears whole or not at all; one that is there already is replaced, but no link and no device. Numbers read
+    back as the same SI values within one unit in the last place. A column has the shortest name that only one channel
+    has, and the unit in ``units`` of its dimension; by default deg, mm, g, and otherwise the SI unit.
     """
     path = Path(path)
-    columns = _columns(path, dataset, requested_channels, units)
-    write_over({path: csv_text([columns, *zip(*columns.values(), strict=True)]).encode()})
-
-
-def _columns(
-    path: Path, dataset: Dataset, requested_channels: Sequence[RequestedChannel], units: Mapping[str, str]
-) -> dict[str, Sequence[str]]:
     unknown = sorted(set(dataset.channels) - {w.channel for w in requested_channels})
     if unknown:
         raise DataError(
@@ -513,7 +482,7 @@ def _columns(
                 hint="Rename the extra column.",
             )
         columns[name] = texts
-    return columns
+    write_over({path: csv_text([columns, *zip(*columns.values(), strict=True)]).encode()})
 
 
 def column_names(

@@ -37,13 +37,10 @@ _FEW_ROWS = 8
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidates by coordinates in typical scales."""
-
     base: Array  # what is known before, as R with R'R the information (rows x n)
     rows: Array  # whitened Jacobians (n_r x N x n); the n_r rows of a candidate enter together
 
     def __post_init__(self) -> None:
-        """Raises ProblemError: not all of it is finite."""
         if not np.isfinite(self.base.sum() + self.rows.sum()):
             text = "what the poses would add to the parameters is not finite at the values they are planned for."
             raise ProblemError(text, hint="Check these values: plan about a calibration that converged, or without.")
@@ -92,7 +89,6 @@ class Candidates:
 
 
 def log_determinant(eigenvalues: Array) -> Array:
-    """Of information with these eigenvalues (... x n)."""
     return np.asarray(np.sum(np.log(np.maximum(eigenvalues, _FLOOR)), axis=-1))
 
 
@@ -122,11 +118,7 @@ class Observability:
 
 
 def observability(singular_values: Array, equations: int) -> Observability:
-    """The indices of a pose set from the singular values (n, in any order, zeros included) of its m equations.
-
-    Raises:
-        ValueError: no singular value, no equation, or a value that is negative or not finite.
-    """
+    """The indices of a pose set from the singular values (n, in any order, zeros included) of its m equations."""
     values = np.asarray(singular_values, dtype=float)
     if not values.size or equations < 1:
         raise ValueError(f"{values.size} singular values of {equations} equations have no observability")
@@ -255,11 +247,7 @@ def _next_active(task: Task, made: Relaxation, active: Indices, most: int) -> In
 
 
 def interior_point(task: Task) -> tuple[Array, Tangent]:
-    """A primal-dual interior-point method in the weights [Nocedal2006].
-
-    Its Newton matrix, the Hessian K K' of the log determinant plus a diagonal, is solved in the smaller of the two
-    sizes.
-    """
+    """A primal-dual interior-point method [Nocedal2006]; its Newton matrix is solved in the smaller of two sizes."""
     number = task.candidates.count
     weights = np.full(number, task.count / number)
     if task.count >= number:
@@ -325,7 +313,6 @@ def _newton_step(curved: Array, diagonal: Array, right: Array) -> tuple[Array, f
 
 
 def _reach(values: Array, step: Array) -> float:
-    """How far along a step the values stay positive, at most 1."""
     falling = step < 0
     if not falling.any():
         return 1.0

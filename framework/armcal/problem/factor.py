@@ -30,11 +30,12 @@ from armcal.base.se3 import Expression, column
 from armcal.base.units import ERROR_UNITS
 from armcal.errors import ProblemError
 from armcal.measure.groups import OTHER
-from armcal.measure.instrument import LimitedView, PointMeasurement
 from armcal.measure.measurement import (
     GroupedMeasurement,
+    LimitedView,
     Measurement,
-    borrowed_values,
+    PointMeasurement,
+    borrowed_names,
     noise_channels,
     residual_dimensions,
 )
@@ -125,10 +126,10 @@ class Factor(ElasticPass):
         return ", ".join(shown) or "no joint"
 
     def hessian_function(self) -> ca.Function:
-        """(values, record, state, W) -> exact Hessian (n_v x n_v) of half of |W residual|^2, in equilibrium.
+        """(values, record, state, W) -> exact Hessian (n_v x n_v) of half of |W residual|^2, in equilibrium, W the
+        whitening.
 
-        W (n_r x n_r) is the whitening. The Lagrangian's second derivative along the equilibrium's tangent.
-        [Griewank2008]
+        The Lagrangian's second derivative along the equilibrium's tangent. [Griewank2008]
         """
         whitening = ca.SX.sym("whitening", self.residual.numel(), self.residual.numel())
         inputs = [*self._inputs, whitening]
@@ -194,7 +195,8 @@ def build_factor(
     groups = measurement if isinstance(measurement, GroupedMeasurement) else None
     group, of_group = _symbols("group", groups.group_parameters("") if groups else ())
     records, states, deflections = _arm_states(measurement, arms, values, environment, available)
-    local = LocalValues({**borrowed_values(measurement, values), **scoped(values, f"{name}."), **of_group})
+    lent = {local: values[full] for local, full in borrowed_names(measurement).items()}
+    local = LocalValues({**lent, **scoped(values, f"{name}."), **of_group})
     reading = _reading(name, measurement, records, states, local, unrolled)
     next_state = ca.densify(ca.vertcat(*[states[a].next_deflection for a in measurement.arms]))
     tools = ca.vertcat(*[ca.vec(states[a].base_T_tool.matrix()[:3, :]) for a in measurement.arms])
@@ -229,8 +231,6 @@ def build_factor(
 
 @dataclass(frozen=True)
 class _Reading:
-    """What an instrument reads, by local names, its residual, and whether it is in view: of one point of many."""
-
     channels: tuple[str, ...]
     outputs: Expression
     residual: Expression
@@ -299,7 +299,7 @@ def _arm_states(
     environment: Environment,
     available: frozenset[str],
 ) -> tuple[_Records, dict[str, ArmState], list[Expression]]:
-    """Each arm in a record under its load, ``@other`` ones in the record's partner; and their deflections' symbols."""
+    """Each arm in a record under its load, ``@other`` ones in its partner; and symbols of their deflections."""
     records = _Records(available)
     acting = [records.optional(*pair) for pair in zip(LOAD_CHANNELS, environment.acting, strict=True)]
     load = tilted(Load.of(acting), scoped(values, f"{STATICS}."))

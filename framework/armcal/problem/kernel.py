@@ -61,24 +61,19 @@ class Interpreter(Backend):
 
     @override
     def residuals(self, values: Array, record: Array, state: Array, residual: Array, rest: float = REST_RAD) -> int:
-        return self._settle(values, record, state, residual, rest)
-
-    @override
-    def linearise(
-        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
-    ) -> int:
-        unsettled = 0
-        if self._has_state:
-            unsettled = self._settle(values, record, state, residual, rest)
-        state[:], residual[:], jacobian[:] = self._linearise(values, record, state)
-        return unsettled
-
-    def _settle(self, values: Array, record: Array, state: Array, residual: Array, rest: float) -> int:
         def following() -> Array:
             following_state, residual[:] = self._pass(values, record, state)
             return following_state
 
         return int(by_passes(following, state, rest).sum())
+
+    @override
+    def linearise(
+        self, values: Array, record: Array, state: Array, residual: Array, jacobian: Array, rest: float = NEAR_REST_RAD
+    ) -> int:
+        unsettled = self.residuals(values, record, state, residual, rest) if self._has_state else 0
+        state[:], residual[:], jacobian[:] = self._linearise(values, record, state)
+        return unsettled
 
 
 class Compiled(Backend):
@@ -110,19 +105,19 @@ class Compiled(Backend):
 
 def agree(factor: Factor, interpreter: Backend, compiled: Backend) -> bool:
     """Whether a library gives the interpreter's numbers; one that was compiled wrong is not used."""
-    results = zip(_sample(factor, interpreter)[2:], _sample(factor, compiled)[2:], strict=True)
+    results = zip(_sample(factor, interpreter), _sample(factor, compiled), strict=True)
     return all(agree_within(*both, _AGREEMENT) for both in results)
 
 
-def _sample(factor: Factor, backend: Backend) -> tuple[Array, Array, Array, Array]:
-    """A random block of records: values, record, and what a backend makes of them, residual and Jacobian."""
+def _sample(factor: Factor, backend: Backend) -> tuple[Array, Array]:
+    """What a backend makes of a random block of records: residual and Jacobian."""
     random, count, rows = np.random.default_rng(0), c_source.LANES, factor.residual.numel()
     record = random.uniform(-1, 1, (factor.record.numel(), count))
     values = random.uniform(0.01, 0.02, factor.values.numel())
     state, residual = np.zeros((factor.state.numel(), count)), np.zeros((rows, count))
     jacobian = np.zeros((rows * factor.values.numel(), count))
     backend.linearise(values, record, state, residual, jacobian)
-    return values, record, residual, jacobian
+    return residual, jacobian
 
 
 def _stride(array: Array) -> int:
@@ -174,7 +169,6 @@ class Kernel:
 
     @cached_property
     def points(self) -> PointRecords | None:
-        """How records of many points are evaluated; None of a factor without points."""
         return None if self.factor.points is None else PointRecords(self.factor.shared, self.factor.points)
 
     def channel_slopes(
@@ -263,8 +257,8 @@ def _out_of_hand(state: Array) -> bool:
 def build_kernel(factor: Factor, records: int, choice: EvaluatorChoice = "auto") -> Kernel:
     """A kernel for about so many records.
 
-    ``auto`` takes a cached library, else waits for the compiler only where that pays, else interprets and lets
-    the compiler work for the next run. ``compiled`` waits; without a compiler it interprets.
+    ``auto`` takes a cached library, else waits for the compiler only where that pays, else interprets and lets the
+    compiler work for the next run. ``compiled`` waits; without a compiler it interprets.
     """
     own = factor.expressed
     interpreter = Interpreter(own)
@@ -316,8 +310,6 @@ Block = tuple[Array, Array]  # Whitened, weighted Jacobian by the free entries (
 
 @dataclass(frozen=True)
 class Shown:
-    """What records show in equilibrium."""
-
     outputs: Array  # what the instrument would read (n_o x N)
     tools: Array  # base_T_tool of each arm, column by column: three axes, then the place (arms x 4 x 3 x N, m)
 
@@ -353,7 +345,6 @@ class GroupedKernel:
         return np.ascontiguousarray(values[entries])
 
     def residuals(self, values: Array, records: FactorRecords) -> Array:
-        """Raw residuals (n_r x width)."""
         residual = np.empty((self.kernel.factor.rows, records.record.shape[1]))
         self._evaluate(self.kernel.residuals, values, records, residual)
         return residual if records.present is None else np.where(records.present, residual, 0.0)
@@ -384,10 +375,7 @@ class GroupedKernel:
         return starts
 
     def exact_hessian(self, values: Array, records: FactorRecords) -> Array:
-        """Hessian of half the squared whitened residuals by the free entries (n x n), at states in equilibrium.
-
-        Of measurements of many points the Gauss-Newton one: their residuals are near zero where it counts.
-        """
+        """Of half the squared whitened residuals (n x n), in equilibrium; of many points the Gauss-Newton one."""
         if self.kernel.points is not None:
             blocks = (jacobian for jacobian, _ in self.linearised(values, records))
             return sum((np.einsum("rvn,rwn->vw", b, b, optimize=True) for b in blocks), np.zeros((self.width,) * 2))

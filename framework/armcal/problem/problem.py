@@ -83,8 +83,6 @@ def stacked(rows: Sequence[ExtraRows], width: int) -> ExtraRows:
 
 @dataclass(frozen=True)
 class TieFunction:
-    """One tie, ready to evaluate."""
-
     groups: tuple[str, str]  # the keys
     entries: Indices  # positions in a value vector of what it holds together (n)
     noise: Array  # standard deviation of each entry of its residual
@@ -110,7 +108,6 @@ class TieFunction:
         return cls(owned.tie.groups, np.array(entries, dtype=np.intp), np.array(owned.tie.noise), function, bend)
 
     def residual(self, values: Array) -> Array:
-        """What is left open at a value vector (m or rad)."""
         return np.asarray(self.function(values[self.entries])[0]).ravel()
 
     def rows(self, values: Array, places: Mapping[int, int], width: int) -> ExtraRows:
@@ -146,11 +143,7 @@ class Blueprint:
     groups: Groups = field(default_factory=dict)
 
     def with_corrections(self, dataset: Dataset) -> Dataset:
-        """The records with corrections of the arms that have a pose residual: zero where it has not learned.
-
-        They depend on what was commanded alone, so they are made once, in batches, and no expression holds what was
-        learned.
-        """
+        """With corrections, made once for all, of arms with a pose residual: zero where it has not learned."""
         channels = dict(dataset.channels)
         for arm in self.arms.values():
             if arm.residual is not None and arm.residual.is_learned:
@@ -168,7 +161,6 @@ class Blueprint:
         )
 
     def grouped(self, kernels: Sequence[Kernel], parameters: Parameters) -> tuple[GroupedKernel, ...]:
-        """Each kernel with the places of its values; ``parameters`` are the same blocks with what is free now."""
         names, compiled, width = parameters.entry_names, self.parameters, len(parameters.free_entries)
         place = np.full(len(names), HELD, dtype=np.intp)
         place[list(parameters.free_entries)] = np.arange(width)
@@ -239,11 +231,9 @@ class Compiled:
 
     @cached_property
     def places(self) -> dict[int, int]:
-        """Of free entries by position in the value vector."""
         return {entry: i for i, entry in enumerate(self.parameters.free_entries)}
 
     def records(self, dataset: Dataset, weights: Array | None = None) -> tuple[FactorRecords, ...]:
-        """A dataset as the kernels read it; ``weights`` (N) multiply each record's squared residual."""
         plan = self.blueprint
         dataset = with_partners(plan.with_corrections(dataset), plan.measurements)
         factors = [kernel.factor for kernel in self.kernels]
@@ -306,7 +296,6 @@ class Problem:
         return cls(compiled, compiled.records(dataset))
 
     def of(self, dataset: Dataset, weights: Array | None = None) -> Self:
-        """The same problem of other records; ``weights`` (N) multiply each one's squared residual."""
         return replace(self, records=self.compiled.records(dataset, weights))
 
     def with_records(self, records: Sequence[FactorRecords]) -> Self:
@@ -325,7 +314,6 @@ class Problem:
         return replace(self, compiled=replace(self.compiled, blueprint=replace(self.blueprint, arms=arms)))
 
     def evaluated_by(self, evaluator: EvaluatorChoice) -> Self:
-        """The same problem by another evaluator; ``compiled`` waits for the compiler."""
         kernels = self.blueprint.kernels(0, dict.fromkeys(self.blueprint.measurements, evaluator))
         return replace(self, compiled=replace(self.compiled, kernels=kernels))
 
@@ -338,7 +326,6 @@ class Problem:
         return self.with_records(alike)
 
     def weighted(self, weights: Sequence[Array]) -> Self:
-        """With the weights of records multiplied, factor by factor (N each)."""
         return replace(self, records=weighted(self.records, weights))
 
     @property
@@ -430,7 +417,6 @@ class Problem:
         return self.whitened(self.residuals(values))
 
     def whitened(self, residuals: Sequence[Array]) -> tuple[Array, ...]:
-        """Raw residuals in units of their noise, one (n_r x N) matrix a factor."""
         return tuple(
             transformed(record.whitening[:, :, : record.count], residual)
             if record.whitening is not None
@@ -497,7 +483,6 @@ class Problem:
         return tuple(grouped.predict(values, record) for grouped, record in self.pairs)
 
     def by_channel(self, shown: Sequence[Shown]) -> dict[str, Array]:
-        """Of what ``predict`` gives, the outputs by channel (N each)."""
         pairs = [(kernel.factor.output_channels, own.outputs) for kernel, own in zip(self.kernels, shown, strict=True)]
         return {name: row for names, rows in pairs for name, row in zip(names, rows, strict=True)}
 
@@ -575,7 +560,6 @@ class PosedProblem:
             return float("inf")
 
     def model(self, x: Array) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian by ``x``."""
         data = self.problem.normal_equations(self.values(x))
         gradient, hessian = self._chained(x, data)
         curvature = self.problem.parameters.curvature(self._entry_gradient(x, data.gradient))
@@ -583,7 +567,6 @@ class PosedProblem:
         return NormalEquations(data.cost + self._prior_cost(x), gradient, hessian)
 
     def convex_model(self, x: Array) -> NormalEquations:
-        """Cost, gradient and Gauss-Newton Hessian by ``c``."""
         chain = self.problem.parameters.entries_jacobian(self.values(x)) * self.coordinate_scales
         data = self.problem.normal_equations(self.values(x)).chained(chain)
         gradient = data.gradient + self._prior * self.coordinates(x)
@@ -618,7 +601,6 @@ class PosedProblem:
         return jacobian * self.scales / self.coordinate_scales[:, None]
 
     def _entry_gradient(self, x: Array, data: Array) -> Array:
-        """The gradient by canonical entries, with that of the priors where entries are coordinates."""
         by_prior = self._prior * self.coordinates(x) / self.coordinate_scales
         return data + self.problem.parameters.entries_jacobian(self.values(x)) @ by_prior
 
@@ -658,7 +640,6 @@ def require_numbers(problem: Problem, dataset: Dataset) -> None:
 
 
 def _check_displacements(problem: Problem, dataset: Dataset) -> None:
-    """Refuse an effect that displaces a joint by no number in a record."""
     plan, nominal = problem.blueprint, problem.parameters.nominal()
     for arm in plan.arms.values():
         postures = arm.postures(dataset, plan.environment)

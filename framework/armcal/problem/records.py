@@ -156,9 +156,8 @@ def weighted(records: Sequence[FactorRecords], weights: Sequence[Array]) -> tupl
 def mean_shares(factor: Factor, factor_records: FactorRecords) -> list[Array]:
     """Of each group whose mean weighs more than its records say, what each record adds to a row (width).
 
-    The shares go with residuals in units of the declared noise: the mean of a group is that of its records by their
-    weights alone, whatever is known of their own noise. Records of total weight n whose residuals have the mean m give
-    n |m|^2 to a sum of squares; with the row as many times more as the measurement says.
+    The shares go with residuals in units of the declared noise. Records of total weight n whose residuals have the mean
+    m give n |m|^2 to a sum of squares; with the row as many times more as the measurement says.
     """
     if factor.mean_weight <= 1 or factor_records.group is None:
         return []
@@ -179,7 +178,6 @@ def _filled(chosen: Indices, last: int) -> Indices:
 
 
 def _whitening(factor: Factor, dataset: Dataset, fill: Indices) -> Array | None:
-    """From the records' own noise; None if no record states any."""
     stated = [next((channel for channel in own if dataset.has(channel)), None) for own in factor.noise_channels]
     if not any(stated):
         return None
@@ -207,7 +205,6 @@ def noise_roots(factor: Factor, records: FactorRecords) -> Array:
 
 
 def by_covariance(covariances: Array) -> Array:
-    """From each record's covariance (n_r x n_r x N); LinAlgError if one is not positive definite."""
     lower = np.linalg.cholesky(np.moveaxis(covariances, 2, 0))
     identity = np.broadcast_to(np.eye(lower.shape[1]), lower.shape)
     return np.ascontiguousarray(np.moveaxis(np.linalg.solve(lower, identity), 0, 2))
@@ -250,7 +247,6 @@ class PointRecords:
         )
 
     def repeated(self, state: Array) -> Array:
-        """What is one for a record (n x N), for each of its points (n x N P)."""
         return np.repeat(state, self.count, axis=1)
 
     def joined(self, rows: Array) -> Array:
@@ -265,8 +261,6 @@ _LEAST_SHARED = 1e-3  # Of the noise's variance: a part of the covariance that i
 
 @dataclass(frozen=True)
 class _Node:
-    """One step of the filter."""
-
     left: Array  # how much of each state the node before passes on (n_s); none to the first
     records: Indices  # those at this node
     slopes: Array  # their rows by the states (m x n_s)
@@ -368,7 +362,6 @@ class Correlation:
 
     @cached_property
     def _steps(self) -> tuple[_Node, ...]:
-        """The filter, which depends on slopes and places alone."""
         by_record, order = self._stacked(self.slopes), np.argsort(self.node, kind="stable")
         ends = np.searchsorted(self.node[order], np.arange(len(self.apart) + 2))
         covariance, nodes = np.eye(len(self._start)), []

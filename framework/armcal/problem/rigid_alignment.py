@@ -6,11 +6,10 @@ B and b are a Procrustes problem [Umeyama1991]; for a known B all else is linear
 Gauss-Newton steps whose weights fall with the distance [Huber1981], so that a few wrong records decide nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -87,14 +86,12 @@ class Tools:
     places: Array
     rotations: Array
 
-    def subset(self, chosen: Indices) -> Tools:
-        return Tools(self.places[:, chosen], self.rotations[chosen])
+    def subset(self, chosen: Indices) -> Self:
+        return replace(self, places=self.places[:, chosen], rotations=self.rotations[chosen])
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A pose of the base frame in the instrument's, and a place of the target."""
-
     turn: Array  # of the base frame (3 x 3)
     shift: Array  # of it (3, m)
     offset: Array  # by which the target is moved, in the tool's axes (3, m)
@@ -106,7 +103,6 @@ class Alignment:
         return np.asarray(self.turn @ places + self.shift[:, None])
 
     def back(self, measured: Array) -> Array:
-        """Measured positions in the base frame (3 x N, m)."""
         return np.asarray(self.turn.T @ (measured - self.shift[:, None]))
 
 
@@ -235,11 +231,7 @@ def _shown(tools: Tools, turns: Array, shifts: Array, offsets: Array) -> Array:
 
 
 def _slopes(shown: Array, along: Array) -> Array:
-    """How targets move (... x N x 3 x 6+n) by a turn about their middle, a shift, and along directions of the offset.
-
-    ``shown`` is where they are (... x N x 3, m), ``along`` those directions in the instrument's frame (... x N x 3 x
-    n).
-    """
+    """How targets (... x N x 3) move by a turn about their middle, a shift, and along directions (... x N x 3 x n)."""
     arm = shown - shown.mean(axis=-2, keepdims=True)
     slopes = np.zeros((*shown.shape, 6 + along.shape[-1]))
     for axis in range(3):
@@ -267,11 +259,11 @@ class Sighting:
     def size(self) -> float:
         return spread_of(self.measured)
 
-    def subset(self, places: Indices) -> Sighting:
+    def subset(self, places: Indices) -> Self:
         turned = None if self.turned is None else self.turned[places]
-        return Sighting(self.kernel, self.chosen[places], self.measured[:, places], turned)
+        return replace(self, chosen=self.chosen[places], measured=self.measured[:, places], turned=turned)
 
-    def thinned(self, most: int) -> Sighting:
+    def thinned(self, most: int) -> Self:
         return self.subset(np.arange(0, len(self.chosen), max(1, -(-len(self.chosen) // most))))
 
     def off(self, tools: Tools) -> float:
@@ -314,7 +306,6 @@ def tools_of(problem: Problem, values: Array, number: int) -> Tools:
 
 
 def _rotations(quaternions: Array) -> Array:
-    """Matrices (n x 3 x 3) of quaternions w, x, y, z (4 x n)."""
     return np.asarray(Rotation.from_quat(quaternions[[1, 2, 3, 0]].T).as_matrix())
 
 

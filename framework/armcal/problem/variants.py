@@ -34,7 +34,7 @@ from armcal.base.dataset import Dataset
 from armcal.base.parameters import Drift, ParameterBlock
 from armcal.errors import DataError, ProblemError
 from armcal.measure.groups import OTHER
-from armcal.measure.instrument import LimitedView, spread_points
+from armcal.measure.measurement import LimitedView, spread_points
 from armcal.problem.factor import Factor
 from armcal.problem.kernel import GroupedKernel, Kernel
 from armcal.problem.problem import Problem
@@ -48,8 +48,8 @@ def projected(problem: Problem, values: Array) -> Problem:
     """The problem of records whose residuals are zero at these values, for judging rank.
 
     Measured numbers become what the model predicts; where nothing is measured but the joints (a contact), the joint
-    angles move to the nearest ones that fit. A record that no angles fit is left as it is. Records that a Jacobian
-    does not depend on that way are returned as they are, the same objects.
+    angles move to the nearest ones that fit. A record that no angles fit is left as it is, and so are those, the same
+    objects, that a Jacobian does not depend on that way.
     """
     shown = as_predicted(problem, values)
     return shown.with_records(
@@ -70,7 +70,6 @@ def as_predicted(problem: Problem, values: Array) -> Problem:
 
 
 def predicted(problem: Problem, values: Array) -> Problem:
-    """The problem of records with the readings that the values predict."""
     result = []
     for kernel, before, shown in zip(problem.kernels, problem.records, problem.predict(values), strict=True):
         record = before.record.copy()
@@ -190,7 +189,6 @@ def disturbed(problem: Problem, values: Array, noise: Sequence[Array]) -> Proble
 
 
 def _stepped(factor: Factor, factor_records: FactorRecords, slope: Array | None, residual: Array) -> FactorRecords:
-    """The records of a factor with readings nearer to those that have another residual by so much."""
     if not factor.output_channels:
         return factor_records
     if slope is None:
@@ -229,11 +227,9 @@ def with_joint_noise(problem: Problem, values: Array, noise_scale: float = 1.0) 
     """With records whitened by the noise of residuals and of joints together; the same where no joint has any.
 
     The covariance of a residual is its own plus S diag(sd^2) S', with S its derivative by the joints at these values,
-    those of the other record where a measurement lies between two. Records that name the same other one share its
-    noise; that correlation is left out.
-
-    ``noise_scale`` is what the whitened residuals are multiplied by afterwards. Below 1 it leaves the joints' noise as
-    large as stated: records at few joint angles do not show what the joints are off between these.
+    those of the other record where a measurement lies between two (whose noise several may share: that correlation is
+    left out). The whitened residuals are multiplied by ``noise_scale`` afterwards. Below 1 it leaves the joints' noise
+    as large as stated: records at few joint angles do not show what the joints are off between these.
     """
     arms = problem.blueprint.arms.values()
     stated = {
@@ -271,15 +267,13 @@ def corrected(problem: Problem, arm: Arm, corrections: Array) -> Problem:
 
 @dataclass(frozen=True)
 class Moved:
-    """How far corrections move the tool of an arm in each record (N; m): all of them, and parts of them alone."""
-
-    altogether: Array
+    altogether: Array  # how far corrections move the tool of an arm in each record (N; m)
     parts: Mapping[str, Array]  # ``tool``, and those joints that are corrected, by name
 
 
 def moved_by(problem: Problem, values: Array, arm: Arm) -> Moved:
-    """What the pose residual of an arm does in records that carry its corrections."""
-    place = next(i for i, k in enumerate(problem.kernels) if arm.name in _arms_of(problem, k.factor.name))
+    arms = [problem.blueprint.measurements[kernel.factor.name].arms for kernel in problem.kernels]
+    place = next(i for i, names in enumerate(arms) if arm.name in names)
     own, channels = problem.records[place], problem.kernels[place].factor.channels
     size, known = len(arm.correction_channels), dict(zip(channels, own.record[:, : own.count], strict=True))
     corrections = np.array([known.get(channel, np.zeros(own.count)) for channel in arm.correction_channels])
@@ -288,16 +282,12 @@ def moved_by(problem: Problem, values: Array, arm: Arm) -> Moved:
         some = np.zeros((size, own.count))
         some[list(rows)] = corrections[list(rows)]
         shown = corrected(problem, arm, some).predict(values)[place]
-        return np.asarray(shown.tools[_arms_of(problem, problem.kernels[place].factor.name).index(arm.name), 3])
+        return np.asarray(shown.tools[tuple(arms[place]).index(arm.name), 3])
 
     none, joints = tools(()), [i for i in range(len(OF_TOOL), size) if np.any(corrections[i])]
     parts = {"tool": range(len(OF_TOOL)), **{arm.joint_names[i - len(OF_TOOL)]: (i,) for i in joints}}
     apart = {name: np.linalg.norm(tools(tuple(rows)) - none, axis=0) for name, rows in parts.items()}
     return Moved(np.linalg.norm(tools(range(size)) - none, axis=0), apart)
-
-
-def _arms_of(problem: Problem, measurement: str) -> Sequence[str]:
-    return tuple(problem.blueprint.measurements[measurement].arms)
 
 
 def sizes_of(covariances: Sequence[Array]) -> Array:
@@ -333,10 +323,7 @@ FEW_POINTS = 12
 
 
 def with_few_points(problem: Problem) -> Problem:
-    """The problem with at most so many points of each measurement, spread over all of them.
-
-    The same object where nothing is to be left out, and where a drift correlates the records.
-    """
+    """The problem with at most so many points of each measurement, spread over all; unchanged beside a drift."""
     many = [kernel.factor.points is not None and len(kernel.factor.points) > FEW_POINTS for kernel in problem.kernels]
     if not any(many) or problem.correlation is not None:
         return problem
@@ -394,13 +381,11 @@ def as_seen(problem: Problem, values: Array, dataset: Dataset) -> tuple[Dataset,
 
 @dataclass(frozen=True)
 class Chain:
-    """The places of records in a recording, in order, each once."""
-
     channels: tuple[str, ...]  # what parameters drift over (``sequence``, or ``time`` in s)
     places: Array  # of each node in each channel (n_k x channels)
 
     def nodes(self, dataset: Dataset) -> Indices:
-        """Which node each record is at (N); all their places must be on the chain."""
+        """All places must be on the chain (N)."""
         own = np.stack([dataset.column(channel) for channel in self.channels], axis=1)
         nodes = np.unique(np.vstack([self.places, own]), axis=0, return_inverse=True)[1].ravel()
         return nodes[len(self.places) :]
@@ -440,7 +425,7 @@ def _drifting(problem: Problem) -> list[tuple[ParameterBlock, Drift]]:
 
 
 def with_drift(problem: Problem, dataset: Dataset, values: Array, along: Chain | None = None) -> Problem:
-    """The problem of a dataset with its records correlated as drifting parameters demand, by slopes at ``values``.
+    """The problem of a dataset whose records are correlated as drifting parameters demand, by slopes at ``values``.
 
     ``along`` is the chain of a recording that has more records than these.
     """
@@ -472,8 +457,6 @@ LOADS = ("turn_x", "turn_y", "turn_z", "gravity", "mass", "moment_x", "moment_y"
 
 @dataclass(frozen=True)
 class Motion:
-    """Records as an arm goes through them."""
-
     channels: tuple[str, ...]  # the command channels of all joints of all arms
     slopes: tuple[Array, ...]  # raw residual by these, one (n_r x joints x N) array a factor (m/rad and the like)
     loads: Mapping[str, SiteLoads]  # of each arm
@@ -501,7 +484,6 @@ class Motion:
         return Motion(self.channels, tuple(slope[..., chosen] for slope in self.slopes), loads, by_load)
 
     def along(self, channel: str) -> tuple[Array, ...]:
-        """Raw residual by one joint's command, one (n_r x N) array a factor."""
         place = self.channels.index(channel)
         return tuple(slope[:, place] for slope in self.slopes)
 
@@ -515,7 +497,6 @@ def recorded_order(dataset: Dataset) -> Array:
 
 
 def recorded_position(dataset: Dataset) -> Indices:
-    """How many records were recorded before each (N)."""
     position = np.empty(len(dataset), dtype=np.intp)
     position[np.argsort(recorded_order(dataset), kind="stable")] = np.arange(len(dataset))
     return position

@@ -31,7 +31,7 @@ from armcal.estimate.validation import (
 )
 from armcal.io.parallel import Executor
 from armcal.measure.groups import PairedMeasurement
-from armcal.measure.instrument import Contact
+from armcal.measure.measurement import Contact
 from armcal.problem.variants import Moved, corrected, sizes_of, unexplained
 from armcal.run.experiment import Experiment
 

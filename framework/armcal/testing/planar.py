@@ -12,8 +12,7 @@ from armcal.base.arrays import Array
 from armcal.base.dataset import Dataset
 from armcal.base.parameters import ParameterBlock, Parameters, scalar
 from armcal.base.se3 import Expression
-from armcal.measure.instrument import Instrument
-from armcal.measure.measurement import Channel
+from armcal.measure.measurement import Channel, Instrument
 
 ARM, TRACKER = "arm", "tracker"
 GRAVITY = Environment((0.0, 0.0, -9.81))

@@ -12,8 +12,7 @@ from armcal.arm.model import Chain
 from armcal.base.parameters import scalar
 from armcal.base.se3 import Transform
 from armcal.base.settings import Angle, Length3, Settings, UnitOf
-from armcal.measure.instrument import Instrument, InstrumentSettings, named_arm
-from armcal.measure.measurement import Channel
+from armcal.measure.measurement import Channel, Instrument, InstrumentSettings, named_arm
 from pydantic import Field
 
 

@@ -15,8 +15,7 @@ from armcal.base import se3
 from armcal.base.domains import Interval
 from armcal.base.parameters import scalar
 from armcal.base.settings import Length, Settings
-from armcal.measure.instrument import Contact
-from armcal.measure.measurement import Channel
+from armcal.measure.measurement import Channel, Contact
 from pydantic import ConfigDict
 
 """Sound components leave it alone."""

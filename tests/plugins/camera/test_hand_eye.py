@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from armcal.base.arrays import Array
-from armcal.measure.instrument import Reading
+from armcal.measure.measurement import Reading
 from armcal_camera.board import Chessboard, Tag
 from armcal_camera.camera import Camera, CameraSettings, first_guess
 from armcal_camera.intrinsics import DISTORTION, IntrinsicsSettings
