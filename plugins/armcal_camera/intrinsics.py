@@ -19,7 +19,7 @@ from armcal.base.settings import Settings, UnitOf
 from armcal.io.plain_files import input_bytes, refuse
 from pydantic import Field
 
-from armcal_camera.board import opencv, or_file
+from armcal_camera.board import or_file
 
 Lens: TypeAlias = Literal["pinhole", "fisheye"]
 Pixels: TypeAlias = Annotated[float, UnitOf("image")]
@@ -27,7 +27,6 @@ DISTORTION = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2",
 """Names of the distortion coefficients of each model, in OpenCV's order."""
 _NUMBER = re.compile(r"[-+.0-9eE]+")
 _STEPS = 40
-_STEEPEST = 20.0  # Of rays: beyond 87 deg from the axis no lens of these models says where they come from
 _NO_ANGLE = 1e-24
 _MOST_BYTES = 1024**2
 _FISHEYE = {"equidistant", "fisheye"}
@@ -162,9 +161,15 @@ def projected(lens: str, point: Any, focal: Any, centre: Any, distortion: Any) -
 
 
 def normalised(lens: str, image: Array, focal: Array, centre: Array, distortion: Array) -> Array:
-    """Undistorted x / z and y / z (N x 2) of places in an image (N x 2)."""
-    matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
-    undistort = (opencv().fisheye if lens == "fisheye" else opencv()).undistortPoints
-    places = np.asarray(image, dtype=float).reshape(-1, 1, 2)
-    rays = undistort(places, matrix, distortion, criteria=(3, _STEPS, 1e-15)).reshape(-1, 2)
-    return np.asarray(rays.clip(-_STEEPEST, _STEEPEST))
+    """Undistorted x / z and y / z (N x 2) of places in an image (N x 2), by fixed-point iteration."""
+    seen = (image - centre) / focal
+    if lens == "fisheye":
+        turned = angle = np.hypot(*seen.T)
+        for _ in range(_STEPS):
+            t2 = angle * angle
+            angle = turned / (1 + t2 * np.polyval(distortion[::-1], t2))
+        return np.asarray(seen * np.tan(np.clip(angle, 0.0, 1.5))[:, None] / np.maximum(turned, 1e-12)[:, None])
+    here = seen
+    for _ in range(_STEPS):
+        here = here + (seen - np.array(pinhole(here[:, 0], here[:, 1], distortion)).T)
+    return np.asarray(here)
