@@ -15,12 +15,11 @@ from armcal.io.plain_files import input_bytes, refuse, text_of
 from armcal.measure.reader import ReadRequest
 from scipy.spatial.transform import Rotation
 
-from armcal_tracker.csv_reader import FEWEST, QUATERNION, WORST, misfit, turned_alike
+from armcal_tracker.csv_reader import FEWEST, ORDERS, QUATERNION, WORST, misfit, turned_alike
 
 _MAX_BYTES, _TOLERANCE = 16 * 1024**2, 1e-3
 _FLANGE = ("x", "y", "z", "rz", "ry", "rx")
 _ALIKE, _CLEARLY = 0.01, 25.0  # less than 1 % may be the camera's; of squares, at least five times nearer
-_ORDERS = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "XZY", "YXZ", "YZX", "ZXY", "xzy", "yxz", "yzx", "zxy", "zyz")
 _VECTOR = "rotation vectors"
 _HINT = "Give the file of samples that moveit_calibration or easy_handeye2 saved, whole."
 
@@ -87,7 +86,7 @@ def _refuse_other_angles(path: Any, hand: Rotation, marker: Rotation, inverts: b
     if math.degrees(off) < WORST[1][0]:
         return
     for whose, turns in (("hand", hand), ("marker", marker)):
-        for taken, meant in itertools.permutations((_VECTOR, *_ORDERS), 2):
+        for taken, meant in itertools.permutations((_VECTOR, *ORDERS), 2):
             numbers = turns.as_rotvec() if taken == _VECTOR else turns.as_euler(taken, suppress_warnings=True)
             clear = np.ones(len(numbers), dtype=bool)
             if meant == _VECTOR:  # of two triples for one rotation that whose length is a turn's

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from armcal.arm.assembly import Arm
 from armcal.errors import DataError
 from armcal.measure.reader import ReadRequest, requested_channels
 from armcal_mdh.model import MdhModel, MdhSettings
-from armcal_tracker.csv_reader import PoseCsvReader, PoseCsvSettings, misfit, nominal_rotations
+from armcal_tracker.csv_reader import ORDERS, PoseCsvReader, PoseCsvSettings, misfit, nominal_rotations
 from armcal_tracker.position import TipPose, TipPoseSettings
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -358,3 +360,26 @@ def test_which_measurement_reads_orientations(tmp_path):
 def test_settings_that_make_no_sense(settings, said):
     with pytest.raises(ValidationError, match=said):
         PoseCsvSettings.model_validate({"path": "poses.csv", **settings})
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "words"),
+    [("ZXY", (1, 1, 1), "order: ZXY"), ("ZYZ", (1, 1, 1), "order: ZYZ"), ("xyz", (-1, 1, 1), "with a negated")],
+)
+def test_any_order_of_the_turns_and_signs_of_the_angles_are_named(tmp_path, order, signs, words):
+    angles = joints(40)
+    written = table(angles, seen(angles).as_euler(order) * signs, "abc")
+    told = refusal(tmp_path, written, rpy={"columns": list("abc"), "unit": "rad"})
+    assert re.search(rf"with [^.]*{words}[^.]* by 0\.", told), told
+
+
+@pytest.mark.parametrize("tables", [10, pytest.param(200, marks=pytest.mark.slow)])
+def test_sound_angles_of_a_rough_arm_are_not_refused(tmp_path, tables):
+    """Of 8 to 40 records, with turns off by up to 3 deg."""
+    for number in range(tables):
+        drawn = np.random.default_rng(number)
+        angles = joints(int(drawn.integers(8, 41)))
+        off = Rotation.from_rotvec(np.deg2rad(10 ** drawn.uniform(-2, 0.5)) * drawn.normal(size=(len(angles), 3)))
+        order = ORDERS[number % len(ORDERS)]
+        text = table(angles, (seen(angles) * off).as_euler(order, suppress_warnings=True), "abc")
+        read(tmp_path, text, euler={"columns": list("abc"), "order": order, "unit": "rad"})
