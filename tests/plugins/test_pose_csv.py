@@ -362,15 +362,14 @@ def test_settings_that_make_no_sense(settings, said):
         PoseCsvSettings.model_validate({"path": "poses.csv", **settings})
 
 
-@pytest.mark.parametrize(
-    ("order", "signs", "words"),
-    [("ZXY", (1, 1, 1), "order: ZXY"), ("ZYZ", (1, 1, 1), "order: ZYZ"), ("xyz", (-1, 1, 1), "with a negated")],
-)
-def test_any_order_of_the_turns_and_signs_of_the_angles_are_named(tmp_path, order, signs, words):
+@pytest.mark.parametrize(("order", "signs"), [("ZXY", (1, 1, 1)), ("ZYZ", (1, 1, 1)), ("xyz", (-1, 1, 1))])
+def test_any_order_of_the_turns_and_signs_of_the_angles_are_tried(tmp_path, order, signs):
+    """Some are one another's, up to fixed rotations of base and body: what is named fits as well."""
     angles = joints(40)
     written = table(angles, seen(angles).as_euler(order) * signs, "abc")
     told = refusal(tmp_path, written, rpy={"columns": list("abc"), "unit": "rad"})
-    assert re.search(rf"with [^.]*{words}[^.]* by 0\.", told), told
+    declared, named = (float(x) for x in re.findall(r"by (\d+\.\d+) deg", told))
+    assert named < 3.0 < 20.0 < declared, told
 
 
 @pytest.mark.parametrize("tables", [10, pytest.param(200, marks=pytest.mark.slow)])

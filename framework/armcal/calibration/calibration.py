@@ -28,7 +28,6 @@ from armcal.calibration.calibration_file import (
     predict,
     read_record,
     readable,
-    require_present,
 )
 from armcal.calibration.compensation import Commands, Compensator, Options
 from armcal.calibration.intervals import PlusMinus, Uncertainty
@@ -44,6 +43,7 @@ from armcal.errors import (
     InputError,
     Location,
     NotConvergedError,
+    PluginError,
 )
 from armcal.estimate.variance import Component
 from armcal.measure.measurement import Measurement
@@ -107,7 +107,17 @@ class Calibration:
         if identity_of(description) != record.identity.get("arm"):
             text = "the description of the arm does not match its identity: the file was edited or damaged."
             raise ConfigError(text, where=where, hint="Change the experiment's configuration and run it again.")
-        require_present(record.components, registry, where)
+        offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
+        for kept in record.components:
+            if (kept.kind, kept.name) not in offered:
+                given = f"{kept.distribution or kept.plugin} {kept.version}".strip()
+                is_file = kept.distribution.endswith(".py")
+                raise PluginError(
+                    f"it was made with the {kept.kind} {kept.name!r} of the plugin{' file' if is_file else ''} "
+                    f"{given}, which is not loaded.",
+                    where=where,
+                    hint=f"Give that file: --plugin {kept.distribution}." if is_file else "Install that plugin.",
+                )
         system = build_system(source, registry)
         parameters = system.parameters(record.groups)
         values = {entry.name: entry.value for entry in record.parameters}
@@ -420,9 +430,7 @@ _MODEL_ZERO = re.compile(r"(theta|offset)(\d+)")
 
 @dataclass(frozen=True)
 class Zero:
-    """How far a joint stands from its command at zero (deg), with its standard deviation."""
-
-    degrees: float
+    degrees: float  # how far a joint stands from its command at zero
     sd_deg: float
 
 

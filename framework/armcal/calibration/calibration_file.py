@@ -30,7 +30,7 @@ from armcal.calibration.intervals import PredictionRecord
 from armcal.calibration.tool_expression import poses_of
 from armcal.config.system import System
 from armcal.config.yaml_source import ConfigSource, load_config, needs_quotes
-from armcal.errors import ConfigError, Location, PluginError
+from armcal.errors import ConfigError, Location
 from armcal.estimate.estimator import Estimate
 from armcal.estimate.identifiability import DeterminedBy
 from armcal.measure.groups import PairedMeasurement
@@ -299,20 +299,6 @@ def components(system: System, registry: PluginRegistry) -> tuple[ComponentRecor
             source=_source(component.target.partition(":")[0]),
         )
     return tuple(records.values())
-
-
-def require_present(kept: tuple[ComponentRecord, ...], registry: PluginRegistry, where: Location) -> None:
-    offered = {(component.kind, component.name) for component in registry.components} | {("core", "arm")}
-    for record in kept:
-        if (record.kind, record.name) not in offered:
-            given = f"{record.distribution or record.plugin} {record.version}".strip()
-            is_file = record.distribution.endswith(".py")
-            raise PluginError(
-                f"it was made with the {record.kind} {record.name!r} of the plugin{' file' if is_file else ''} "
-                f"{given}, which is not loaded.",
-                where=where,
-                hint=f"Give that file: --plugin {record.distribution}." if is_file else "Install that plugin.",
-            )
 
 
 def differences(kept: tuple[ComponentRecord, ...], now: tuple[ComponentRecord, ...]) -> list[str]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armcal.arm.assembly import Arm, within_couplings
-from armcal.arm.joints import Limits, joint_limits
+from armcal.arm.joints import joint_limits
 from armcal.arm.servo import PulseClock, PulseTable
 from armcal.arm.statics import LOAD_CHANNELS, Environment
 from armcal.base.arrays import Array, Indices, Mask
@@ -144,22 +144,6 @@ def _check(what: str, array: Array, shape: tuple[int, ...]) -> None:
         raise ValueError(f"found {what} of the shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():
         raise ValueError(f"found {what} that are not finite numbers")
-
-
-def command_limits(expression: ToolExpression, stated: Mapping[str, Limits]) -> Array:
-    """Lowest and highest command of each joint (n x 2; rad or m): stated ones, the model's, else infinite.
-
-    A servo's pulse table is known between its ends only, so a joint with one stays between them too.
-    """
-    known = joint_limits(expression.arm.nominal_chain, stated)
-    limits = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
-    for i, joint in enumerate(expression.joints):
-        if joint in expression.servos:
-            angles = expression.servos[joint][0].angles
-            limits[i] = max(limits[i, 0], angles[0]), min(limits[i, 1], angles[-1])
-        if not limits[i, 0] < limits[i, 1]:
-            raise ValueError(f"the limits of {joint}, {limits[i, 0]:g} to {limits[i, 1]:g}, leave it no room")
-    return limits
 
 
 @dataclass(frozen=True)
@@ -405,7 +389,15 @@ class Compensator:
         coupled = partial(within_couplings, [expression.arm]) if expression.arm.couplings else None
         allowed = self.options.allowed
         self._allowed = (lambda q: allowed(q) & coupled(q)) if allowed and coupled else allowed or coupled
-        self.limits = command_limits(expression, self.options.limits)
+        known = joint_limits(expression.arm.nominal_chain, self.options.limits)
+        self.limits = np.array([known[joint] or (-np.inf, np.inf) for joint in expression.joints])
+        for i, joint in enumerate(expression.joints):
+            if joint in expression.servos:  # its pulse table is known between its ends only
+                angles = expression.servos[joint][0].angles
+                self.limits[i] = max(self.limits[i, 0], angles[0]), min(self.limits[i, 1], angles[-1])
+            if not self.limits[i, 0] < self.limits[i, 1]:
+                low, high = self.limits[i]
+                raise ValueError(f"the limits of {joint}, {low:g} to {high:g}, leave it no room")
         self.reach: Reach = reach_of(expression.arm, parameters, self.limits, expression.tool_T_point)
         self._point_T_tool = np.linalg.inv(evaluated(expression.tool_T_point.matrix()))
         self._equilibrium = Equilibrium(expression, choice)

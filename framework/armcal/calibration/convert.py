@@ -84,7 +84,6 @@ def nominal_values(model: ArmModel) -> dict[str, Array]:
 
 
 def reload(text: str, registry: PluginRegistry) -> Chain:
-    """The nominal chain of a section ``model:``, read like that of any configuration."""
     content = ("arms:\n  arm:\n" + textwrap.indent(text, "    ")).encode()
     source = load_config("converted.yaml", content=content)
     model = build_component(source, registry, "model", ("arms", "arm", "model"))[0]

@@ -373,20 +373,11 @@ def _show_exported(
     console: Console, request: ExportRequest, exported: Exported, moved_m: float | None, files: list[Path], kind: str
 ) -> None:
     apart = None if moved_m is None else moved_m * 1000
-    console.result(
-        {
-            "out": str(files[0]),
-            "files": [str(file) for file in files],
-            "format": kind,
-            "arm": request.name,
-            "changed": exported.changed,
-            "left_out": list(exported.left_out),
-            "left_out_mm": apart,
-            "remarks": list(exported.remarks),
-        }
-    )
-    listed = ", ".join(str(file) for file in files)
-    console.line(f"{request.name}: {exported.changed} numbers changed: {listed}")
+    listed = [str(file) for file in files]
+    content = {"out": listed[0], "files": listed, "format": kind, "arm": request.name, "changed": exported.changed}
+    content |= {"left_out": [*exported.left_out], "left_out_mm": apart, "remarks": [*exported.remarks]}
+    console.result(content)
+    console.line(f"{request.name}: {exported.changed} numbers changed: {', '.join(listed)}")
     for remark in exported.remarks:
         console.warn(f"{remark}.")
     if exported.left_out:
@@ -449,13 +440,8 @@ def convert(
         f"largest difference over {off.poses} poses: "
         f"{off.position_m:.1e} m in position, {off.angle_rad:.1e} rad in angle"
     )
-    content = {
-        "arm": original.arm,
-        "to": target,
-        "poses": off.poses,
-        "largest_position_m": off.position_m,
-        "largest_angle_rad": off.angle_rad,
-    }
+    content = {"arm": original.arm, "to": target, "poses": off.poses}
+    content |= {"largest_position_m": off.position_m, "largest_angle_rad": off.angle_rad}
     if out is None:
         console.result({**content, "text": text})
         if not console.json:

@@ -191,7 +191,6 @@ class Console:
 
     @contextmanager
     def telling_notices(self) -> Iterator[None]:
-        """One line, once, for each notice about a calibration."""
         with warnings.catch_warnings():
             warnings.simplefilter("always", CalibrationWarning)
             others, shown = warnings.showwarning, set()

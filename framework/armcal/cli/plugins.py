@@ -27,20 +27,12 @@ def list_plugins(as_json: bool, quiet: bool, verbose: bool) -> None:
     """List every plugin and what it provides, without importing any of it."""
     registry = discover()
     if as_json:
-        content = [
-            {
-                "name": plugin.name,
-                "module": plugin.module,
-                "distribution": plugin.distribution,
-                "version": plugin.version,
-                "fault": plugin.fault or None,
-                "components": [
-                    {name: getattr(component, name) for name in ("kind", "name", "target", "summary")}
-                    for component in registry.announced_by(plugin)
-                ],
-            }
-            for plugin in registry.plugins
-        ]
+        content = []
+        for plugin in registry.plugins:
+            own = {name: getattr(plugin, name) for name in ("name", "module", "distribution", "version")}
+            offered = registry.announced_by(plugin)
+            listed = [{key: getattr(c, key) for key in ("kind", "name", "target", "summary")} for c in offered]
+            content.append({**own, "fault": plugin.fault or None, "components": listed})
         click.echo(json.dumps({**JSON_SCHEMA, "plugins": content}, indent=2))
     else:
         for plugin in registry.plugins:

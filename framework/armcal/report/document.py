@@ -86,8 +86,6 @@ ReportSection = Section  # what plugins call it
 
 @dataclass(frozen=True)
 class Document:
-    """What there is to say of a result."""
-
     title: str
     headline: str
     sections: Sequence[Section]

@@ -24,8 +24,6 @@ _LOG_ALL_STEPS, _LOG_SOME_STEPS = 2.2, 4.0  # decades
 
 @dataclass(frozen=True)
 class Axis:
-    """Data from ``low`` to ``high`` onto pixels from ``start`` to ``end``."""
-
     low: float
     high: float
     start: float
@@ -125,8 +123,9 @@ def _frame(panel: Panel, x: Axis, y: Axis) -> list[str]:
     parts = []
     for at, label in x.ticks(5):
         parts += [_line(at, top, at, bottom, "grid"), _text(at, bottom + 15, label, "tick", "middle")]
-    for at, label in zip(y.at(np.arange(len(panel.rows), dtype=float)).tolist(), panel.rows, strict=True):
-        parts += [_text(x.start - 7, at + 4, shorten(label), "mono", "end"), _line(x.start, at, x.end, at, "grid")]
+    for at, name in zip(y.at(np.arange(len(panel.rows), dtype=float)).tolist(), panel.rows, strict=True):
+        label = name if len(name) <= 24 else f"{name[:11]}…{name[-12:]}"
+        parts += [_text(x.start - 7, at + 4, label, "mono", "end"), _line(x.start, at, x.end, at, "grid")]
     for at, label in [] if panel.rows else y.ticks(5):
         parts += [_line(x.start, at, x.end, at, "grid"), _text(x.start - 6, at + 4, label, "tick", "end")]
     parts.append(_line(x.start, bottom, x.end, bottom, "axis"))
@@ -160,10 +159,6 @@ def _text(x: float, y: float, content: str, css: str, anchor: str, more: str = "
 
 def _line(x1: float, y1: float, x2: float, y2: float, css: str) -> str:
     return f'<path class="{css}" d="M{x1:.1f} {y1:.1f}L{x2:.1f} {y2:.1f}"/>'
-
-
-def shorten(name: str, most: int = 24) -> str:
-    return name if len(name) <= most else f"{name[: most // 2 - 1]}…{name[-(most - most // 2) :]}"
 
 
 _WORDS = {"bad": "Bad", "warning": "Warning", "note": "Note", "good": "Passed"}

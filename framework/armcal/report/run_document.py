@@ -45,7 +45,6 @@ class SectionMaker(Protocol):
 
 
 def plugin_sections(result: RunResult, registry: PluginRegistry) -> tuple[list[Section], list[str]]:
-    """The sections that plugins have for a run, by name, and why some could not be made."""
     sections, faults = list[Section](), list[str]()
     for name in sorted({c.name for c in registry.components if c.kind == "report_section"}):
         try:
@@ -107,7 +106,6 @@ def run_document(result: RunResult, sections: Sequence[Section] = ()) -> Documen
 
 
 def noise_text(result: RunResult) -> str:
-    """How much of the error on the records that judge is the noise that their instrument is stated to have."""
     noise, errors = noise_of(result), result.errors
     _, holdout = roles(result)
     crossed = np.isfinite(errors.cross_validated_mm)
@@ -166,7 +164,6 @@ def _some(*parts: Part | None) -> list[Part]:
 
 
 def _determined(estimate: Estimate) -> Section:
-    """What the data hardly determine, or not: combinations of parameters, and pairs that are correlated."""
     known, names = estimate.identifiability, estimate.names
     parts: list[Part] = [f"{determined_in_words(estimate.sources)}."]
     parts += [f"The data does not determine a combination: {combination}." for combination in known.undetermined]
@@ -246,7 +243,6 @@ def roles(result: RunResult) -> tuple[Mask, Mask]:
 
 
 def in_space(result: RunResult) -> Figure | None:
-    """Errors of the nominal and of the calibrated arm over the workspace, by one scale; None without positions."""
     errors, position = result.errors, result.errors.position_mm
     unit, panels = errors.unit, list[Panel]()
     shown = {"nominal": errors.nominal_mm, "calibrated": errors.calibrated_mm}
@@ -291,7 +287,6 @@ def _ends_of(places: Array) -> tuple[Array, Array]:
 
 
 def _box(places: Array) -> list[Marks]:
-    """The edges of the box that holds the places, and the names of its axes, outside of it."""
     low, high = _ends_of(places)
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(corners[a] - corners[b]).sum() == 1]
@@ -306,7 +301,6 @@ def _box(places: Array) -> list[Marks]:
 
 
 def distribution(result: RunResult) -> Figure | None:
-    """Share of records below each error, nominal and calibrated, and what noise alone does; None without records."""
     train, holdout = roles(result)
     errors = result.errors
     curves = {
@@ -377,7 +371,6 @@ def corrections(estimate: Estimate) -> Figure | None:
 
 
 def against_joints(result: RunResult) -> Figure | None:
-    """Residuals against what each joint was commanded; None where none moved."""
     data, errors = result.dataset, result.errors
     residual = errors.calibrated_residual_mm
     own = [i for i, name in enumerate(errors.residual_columns) if name.endswith(f"_{errors.unit}")]
@@ -467,7 +460,6 @@ _WORST = 10
 
 
 def errors_table(caption: str, errors: ErrorTable) -> Table:
-    """Of each set that has records, errors of the nominal and the calibrated arm, and without knowledge of a drift."""
     models = (("nominal", errors.nominal), ("calibrated", errors.calibrated), ("drift unknown", errors.at_rest))
     shown: list[tuple[str, str, ErrorSummary]] = []
     for key, words in SETS.items():

@@ -112,7 +112,6 @@ def _variants(result: StudyResult) -> Table:
 
 
 def _cells(result: StudyResult) -> Table:
-    """A row for each variant and what it was trained at, errors at each group beside one another."""
     decimals = common_decimals([c.error_mm.mean for c in result.cells], most=3)
     few, rows, together = len(result.groups) <= _FEW_GROUPS, [], dict[tuple[str, tuple[str, ...]], list[Cell]]()
     for cell in result.cells:

@@ -183,7 +183,6 @@ def _checked(experiment: Experiment, dataset: Dataset, problem: Problem, start: 
 
 
 def fitted(context: RunContext, ready: Prepared) -> WeighedFit:
-    """The fit to the training records, as sure as records that may err alike allow."""
     training, progress = ready.training, context.progress
     estimator = spread(context.experiment.estimator, context.executor)
     with context.watch.stage("fit"):

@@ -189,7 +189,6 @@ def commands_of(dataset: Dataset, space: JointSpace) -> Dataset:
 
 
 def _same_poses(first: Array, second: Array) -> Mask:
-    """Which of the first (joints x N) are among the second (joints x M); (N, bool)."""
     keys = {tuple(column) for column in np.round(second.T / _SAME_POSE).astype(np.int64).tolist()}
     return np.array([tuple(c) in keys for c in np.round(first.T / _SAME_POSE).astype(np.int64).tolist()], dtype=bool)
 
@@ -488,7 +487,6 @@ def _identifiability(task: Task, chosen: Indices, parameters: Parameters) -> Ide
 
 
 def _chosen(task: Task, settings: PlanSettings, parameters: Parameters) -> Plan:
-    """The plan; refused where candidates, or so few of them, leave something open."""
     candidates = task.candidates
     most = _identifiability(task, np.arange(candidates.count), parameters)
     if most.undetermined:
