@@ -21,12 +21,8 @@ boards:
   low: {address: 0x40, oscillator_hz: 25000000.0, rate_hz: 50.0, id: "TOWER"}
   high: {address: 0x41, oscillator_hz: 25000000.0, rate_hz: 50.0, id: "TOWER"}   # on the forearm
 servos:
-  turn:
-    board: low
-    channel: 3
-    angles_deg: [-135.0, 0.0, 135.0]
-    pulses_us: [500.0, 1500.0, 2500.0]      # by the data sheet
-    pulse_range_us: [480.0, 2520.0]
+  turn: {board: low, channel: 3, angles_deg: [-135.0, 0.0, 135.0], pulses_us: [500.0, 1500.0, 2500.0], \
+pulse_range_us: [480.0, 2520.0]}      # by the data sheet
   # the shoulder hangs upside down, so its pulses fall
   lift:
     {board: low, channel: 7, angles_deg: [-135.0, 0.0, 135.0], pulses_us: [2500.0, 1500.0, 500.0],
