@@ -276,3 +276,16 @@ def test_two_hundred_damaged_configurations_never_end_in_a_traceback(tmp_path: P
             or ("does not determine" in result.output)
         ), result.output
     assert codes == {0, 2}
+
+
+def test_positions_in_a_far_frame_are_placed_where_the_base_is_free(tmp_path: Path) -> None:
+    """Total stations count from where a survey began; the unit is right."""
+    lines = [line.split(",") for line in (CONFIGS / "demo.csv").read_text().splitlines()]
+    place = lines[0].index("x_mm")
+    for line in lines[1:]:
+        line[place] = repr(float(line[place]) + 35_000)
+    data = tmp_path / "far.csv"
+    data.write_text("\n".join(",".join(line) for line in lines) + "\n")
+    assert check(data=data).exit_code == 0
+    held = check("parameters.free=[arm.mdh.alpha*]", data=data)
+    refused(held, "base elsewhere by 35000 mm")

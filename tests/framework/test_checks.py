@@ -212,6 +212,17 @@ def test_a_frozen_instrument() -> None:
     assert not checks.set_aside_frozen(frozen(4), layout()).set_aside
 
 
+@pytest.mark.parametrize(("decimals", "count"), [(6, 1), (2, 0)])
+def test_two_records_alike_to_the_last_digit_are_a_frozen_instrument(decimals: int, count: int) -> None:
+    drawn = np.random.default_rng(3)
+    numbers = {name: drawn.uniform(0, 1, 40).round(3) for name in JOINTS}
+    numbers |= {name: drawn.uniform(0, 1, 40).round(decimals) for name in POSITION}
+    for name in POSITION:
+        numbers[name][7] = numbers[name][6]
+    dataset = Dataset(tuple(f"p{i}" for i in range(40)), numbers)
+    assert len(checks.set_aside_frozen(dataset, layout()).set_aside) == count
+
+
 def test_an_arm_at_rest_is_not_a_frozen_instrument() -> None:
     dataset = records()
     for index in range(2, 7):

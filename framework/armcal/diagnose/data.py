@@ -40,7 +40,7 @@ _MOST_SIGNS = 8
 _AXES = "xyz"
 _INCH = 25.4
 _ROUNDED = 1e-6
-_REACH_RATIO = 10.0
+_REACH_RATIO, _ONE_UNIT = 10.0, 3.0  # times as far, and as wide around their middle
 _ALIKE = 0.35  # In powers of ten: so alike are two distances of one unit
 _FEWEST_ROWS, _NEARLY_ALL, _NEAREST = 3, 0.95, 1e-6
 _NEAR = 0.2  # Of their distance from the base: so near are positions to where the nominal arm has them
@@ -136,7 +136,7 @@ def check_reach(problem: Problem, dataset: Dataset) -> None:
         DataError: which, and as which unit they are read.
     """
     shown = problem.predict(problem.parameters.nominal())
-    for kernel, own in zip(problem.kernels, shown, strict=True):
+    for number, (kernel, own) in enumerate(zip(problem.kernels, shown, strict=True)):
         channels = kernel.factor.output_channels
         if [channel.rpartition(".")[2] for channel in channels] != ["x", "y", "z"]:
             continue
@@ -155,12 +155,30 @@ def check_reach(problem: Problem, dataset: Dataset) -> None:
                 hint="Write all rows in the unit of the column names.",
             )
         far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
-        if distances > _REACH_RATIO * far or far > _REACH_RATIO * distances:
-            raise DataError(
-                f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m.",
-                where=where,
-                hint="Check the unit in the column names (x_mm or x_m) and the frame of the measurements.",
-            )
+        if 1 / _REACH_RATIO <= distances / far <= _REACH_RATIO:
+            continue
+        text = f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m"
+        hint = "Check the unit in the column names (x_mm or x_m) and the frame of the measurements."
+        modelled, spread = (
+            float(np.median(np.linalg.norm(x - np.median(x, axis=1, keepdims=True), axis=0)))
+            for x in (own.outputs[:3], measured)
+        )
+        if modelled and 1 / _ONE_UNIT < spread / modelled < _ONE_UNIT:
+            if _can_be_placed(problem, number):
+                continue
+            text = f"{text}; around their middle they spread alike, by {spread:.4g} and {modelled:.4g} m"
+            hint = "The unit is right, the frame is another: free where the base stands in it, or state that."
+        raise DataError(f"{text}.", where=where, hint=hint)
+
+
+def _can_be_placed(problem: Problem, number: int) -> bool:
+    """Whether free parameters move all positions of a factor alike, along each axis, to first order."""
+    noise = np.array(problem.kernels[number].factor.noise[:3])
+    slopes = problem.jacobians(problem.parameters.nominal())[number][:3] * noise[:, None, None]
+    rows = slopes.transpose(2, 0, 1).reshape(-1, slopes.shape[1])
+    shifts = np.tile(np.eye(3), (slopes.shape[2], 1))
+    left = shifts - rows @ np.linalg.lstsq(rows, shifts, rcond=1e-9)[0]
+    return bool((np.linalg.norm(left, axis=0) <= _TURNED * np.linalg.norm(shifts, axis=0)).all())
 
 
 def _in_another_unit(measured: Array, shown: Array) -> tuple[float, Mask]:

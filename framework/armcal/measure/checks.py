@@ -25,6 +25,7 @@ from armcal.measure.groups import first_of_pose
 from armcal.measure.reader import CYCLE, ENVIRONMENT, Reader, ReadRequest, RequestedChannel
 from armcal.plugins import expecting, refuse
 
+_MOVED, _FEWEST_FINE = 1e-3, 10  # rad or m; readings of which none has a number of another: chance repeats none whole
 FROZEN_RECORDS = 5  # So many identical measurements in a row, while the joints moved, and the instrument has stopped
 MAX_BACKWARD_FRACTION = 0.01
 """Of the records; more of them out of order in time, and the time itself is not to be trusted."""
@@ -436,7 +437,7 @@ def set_aside_backward_time(dataset: Dataset, layout: Layout) -> Dataset:
 def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
     """Set aside what an instrument repeats while the joints move: all but the first record of such a run."""
     faulty: dict[int, str] = {}
-    if not layout.joints or len(dataset) < FROZEN_RECORDS:
+    if not layout.joints:
         return dataset
     joints = np.array([_known(dataset, channel) for channel in layout.joints])
     by_instance: dict[str, list[str]] = {}
@@ -447,7 +448,7 @@ def set_aside_frozen(dataset: Dataset, layout: Layout) -> Dataset:
         made = np.flatnonzero(~np.isnan(read).any(axis=0))
         for start, stop in _runs(read[:, made]):
             run = made[start:stop]
-            if np.ptp(joints[:, run], axis=1).any():
+            if np.ptp(joints[:, run], axis=1).max() > _MOVED:
                 since = layout.place(dataset, int(run[0]))
                 reason = f"{instance} repeats the values of {since} while the joints moved: it had frozen"
                 faulty.update(dict.fromkeys(run[1:].tolist(), reason))
@@ -503,9 +504,13 @@ def _known(dataset: Dataset, channel: str) -> Array:
 
 
 def _runs(values: Array) -> list[tuple[int, int]]:
+    """Begin and end of what is repeated: two records already, where no number of three or more ever comes again."""
+    different = len(np.unique(values, axis=1).T)
+    is_fine = len(values) >= 3 and different >= _FEWEST_FINE
+    is_fine = is_fine and all(len(np.unique(row)) == different for row in values)
     changes = np.flatnonzero((values[:, 1:] != values[:, :-1]).any(axis=0)) + 1
     edges = np.concatenate([[0], changes, [values.shape[1]]])
-    long = np.flatnonzero(np.diff(edges) >= FROZEN_RECORDS)
+    long = np.flatnonzero(np.diff(edges) >= (2 if is_fine else FROZEN_RECORDS))
     return [(int(edges[i]), int(edges[i + 1])) for i in long]
 
 
