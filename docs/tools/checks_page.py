@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from armcal.diagnose.checks import DATA_CHECKS, EXACT, FIT_CHECKS, NO_RATE
+from armcal.diagnose.checks import DATA_CHECKS, EXACT, FIT_CHECKS, NO_RATE, NOTES
 
 PAGE = Path(__file__).resolve().parents[1] / "checks.md"
 RUNS = Path(__file__).resolve().parents[2] / "tests" / "data" / "clean_runs.json"
@@ -15,8 +15,8 @@ and what to do; `armcal checks` lists them, those of your plugins too. This page
 
 The last but one column says how often a check warns of sound data of the very model. `0.5 %` is the level of its test:
 all levels add up to 5 %, but that of a held scale, on which every length rests. `0 of 1,200` was counted. A check that
-is `{EXACT}` states a fact; `{NO_RATE}` stands where nothing was counted. A check of your own is
-[one function](write_a_plugin.md#a-check).
+is `{EXACT}` states a fact, one with `{NOTES}` never warns; `{NO_RATE}` stands where nothing was counted. A check of
+your own is [one function](write_a_plugin.md#a-check).
 """
 
 

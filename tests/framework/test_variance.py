@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
+from armcal.diagnose.gross import worse_than_declared
 from armcal.diagnose.record_checks import component_findings
 from armcal.errors import ProblemError
 from armcal.estimate.robust import NoiseSettings, fit, weighed
@@ -289,3 +290,15 @@ def test_a_fit_with_estimated_variances_keeps_the_one_by_the_declared_noise(tmp_
     one, other = (fit(ready.training, e.estimator, ready.start.values(ready.problem)[0]) for e in (plain, weighing))
     assert one.as_declared is None and np.array_equal(other.as_declared, one.estimate.values)
     assert not np.array_equal(other.estimate.values, one.estimate.values)
+
+
+def test_worse_predictions_by_estimated_variances_are_not_chance():
+    random = np.random.default_rng(1)
+    declared, differ = random.uniform(1, 3, 61), 0.5 * random.normal(size=61)
+    declared[-1], differ[:-1] = np.nan, differ[:-1] - differ[:-1].mean()
+    (found,) = worse_than_declared(declared + differ + 0.3, declared)
+    before = np.nanmean(declared)
+    assert found.grade == "note" and f"{before + 0.3:.2f} mm on average, {before:.2f} mm by" in found.text
+    assert not worse_than_declared(declared + differ + 0.05, declared)  # chance makes as much
+    assert not worse_than_declared(declared + 0.01, declared)  # certain, and less than 1 %
+    assert not worse_than_declared(declared - 0.3, declared) and not worse_than_declared(declared * np.nan, declared)

@@ -12,8 +12,8 @@ from typing import Any, Literal, Protocol
 from armcal.plugins import PluginRegistry, said
 
 Grade = Literal["good", "note", "warning", "bad"]
-EXACT, NO_RATE = "exact", "no rate yet"
-"""Of a check that states a fact and tests nothing, or whose false alarms were not counted.
+EXACT, NOTES, NO_RATE = "exact", "notes only", "no rate yet"
+"""Of a check that states a fact and tests nothing, that never warns, or whose false alarms were not counted.
 
 A level, ``0.5 %``, is what a test allows: all levels add up to 5 %, but that of a held scale, on which every length
 rests. A count, ``0 of 1,200``, is of how many sound recordings, of six kinds of instrument, the check warned."""
@@ -114,6 +114,8 @@ FIT_CHECKS = (
     Check("aligned", "Are positions far worse than those aligned before the fit?", "0 of 1,200", "gross:aligned"),
     Check("overfitted", "Are unseen records missed by far more than those that trained?", "2 of 1,200",
           "gross:overfit"),
+    Check("weights", "Does the declared noise predict better than estimated variances?", NOTES, "gross:weights",
+          "noise.md"),
     Check("intervals", "Do prediction intervals cover their share?", "0.5 %", "record_checks:covered"),
     Check("places", "How well are base and target known?", EXACT, "verdict:places"),
     Check("moved", "Did what the arm touches move?", "0 of 1,200", "record_checks:moved", "ball_and_sockets.md"),

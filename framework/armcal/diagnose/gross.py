@@ -25,13 +25,13 @@ from armcal.base.units import digits, display_unit, from_unit, readable, si_unit
 from armcal.diagnose.causes import OFF, held_scales, predicted_positions
 from armcal.diagnose.checks import Finding, Grade, first_few
 from armcal.diagnose.fit import MOST_RECORDS, Fit, FitRows, only_places, sampled_rows, thinned, unconfigured
-from armcal.diagnose.residual_structure import CLEAR, ResidualStructure, Structure, percent, structure
+from armcal.diagnose.residual_structure import CLEAR, WORTHWHILE, ResidualStructure, Structure, percent, structure
 from armcal.errors import NotConvergedError
-from armcal.estimate.estimator import Estimate
+from armcal.estimate.estimator import Estimate, Estimator
 from armcal.estimate.identifiability import Measure, at_random_poses
 from armcal.estimate.robust import Weighing
 from armcal.estimate.start import BETTER
-from armcal.estimate.validation import Halves, halves
+from armcal.estimate.validation import Halves, halves, record_errors
 from armcal.problem import rigid_alignment as rigid
 from armcal.problem.problem import Problem
 from armcal.problem.variants import LOADS, Motion
@@ -358,9 +358,12 @@ def size(fit: Fit) -> list[Finding]:
     return [Finding("warning", text, f"regression on the nominal lengths, t, {levels}", action)]
 
 
+def _inner(fit: Fit) -> Estimator:
+    return fit.estimator.inner if isinstance(fit.estimator, Weighing) else fit.estimator
+
+
 def by_halves(fit: Fit) -> Halves | None:
-    inner = fit.estimator.inner if isinstance(fit.estimator, Weighing) else fit.estimator
-    return halves(fit.acting, inner, fit.estimate.values) if fit.converged else None
+    return halves(fit.acting, _inner(fit), fit.estimate.values) if fit.converged else None
 
 
 def worse(fit: Fit) -> list[Finding]:
@@ -394,7 +397,67 @@ def overfit(fit: Fit) -> list[Finding]:
     return [Finding("warning" if gains else "bad", text, test, action)]
 
 
+def weights(fit: Fit) -> list[Finding]:
+    """Whether the declared noise gives better values than estimated variances do: where a pose is to be known and most
+    of the residuals is the joints', by how far fits to halves have it apart."""
+    fitted, estimated = fit.fitted, fit.of(by_halves)
+    if fitted.components is None or fitted.as_declared is None:
+        return []
+    if estimated is not None and fitted.components.mostly_joints:
+        declared = halves(fit.ready.training.weighted(fitted.weights), _inner(fit), fitted.as_declared)
+        assert declared is not None
+        return [f for name in estimated.apart for f in steadier_weights(name, estimated, declared, fit.unit)]
+    if not len(fit.split.holdout):
+        return []
+    declared_mm = record_errors(fit.problem, fitted.as_declared) * _MM
+    return worse_than_declared(fit.judged_mm, declared_mm, fit.unit)
+
+
 WORSE, POWER = 0.005, 0.9  # Level of a loss against the nominal arm; share of losses of the size stated that is found
+_VALUES_BY_DECLARED = "Leave out noise.estimate for the values, and use it to learn where the noise comes from."
+
+
+def worse_than_declared(judged_mm: Array, declared_mm: Array, unit: str = "mm") -> list[Finding]:
+    """Where held-out records are missed by more than by the fit with the declared noise (N each; nan elsewhere)."""
+    seen = np.isfinite(judged_mm) & np.isfinite(declared_mm)
+    more, before = judged_mm[seen] - declared_mm[seen], float(np.mean(declared_mm[seen])) if seen.any() else 0.0
+    if len(more) < 2 or np.mean(more) <= max(_by_chance(more), WORTHWHILE * before):
+        return []
+    text = (
+        f"Estimated variances make predictions worse: held-out records have an error of "
+        f"{readable(before + float(np.mean(more)))} {unit} on average, {readable(before)} {unit} by the declared noise."
+    )
+    test = "paired differences, one-sided, 5 %, and 1 % of the error"
+    return [Finding("note", text, test, _VALUES_BY_DECLARED)]
+
+
+def steadier_weights(name: str, estimated: Halves, declared: Halves, unit: str) -> list[Finding]:
+    """Which weights keep the pose of a measurement nearer between halves of the records, where joints err most: smaller
+    residuals, which the pose takes up, are then no sign of a better pose."""
+    ours, others = estimated.apart[name], declared.apart[name]
+    seen = np.isfinite(ours).all(axis=1) & np.isfinite(others).all(axis=1)
+    if seen.sum() < 2:
+        return []
+    more, parts = ours[seen] - others[seen], []
+    for own in (estimated, declared):
+        (mm, deg), error = np.mean(own.apart[name][seen], axis=0), np.mean(own.errors[seen])
+        parts.append(f"{readable(float(mm))} mm and {readable(float(deg))} deg ({readable(float(error))} {unit})")
+    for sign, action in ((1, _VALUES_BY_DECLARED), (-1, "Keep noise.estimate.")):
+        mm, deg = sign * more.T
+        if np.mean(mm) > max(_by_chance(mm), WORTHWHILE * np.mean(others[seen, 0])) and np.mean(deg) > 0:
+            text = (
+                f"{name}: its pose differs between halves of the records by {parts[0]} with estimated variances, by "
+                f"{parts[1]} with the declared noise; in brackets the error of records by the fit to the other half, "
+                "which is the joints' and does not rank poses."
+            )
+            test = f"{seen.sum()} divisions, paired differences, one-sided, 5 %, and 1 %"
+            return [Finding("note", text, test, action)]
+    return []
+
+
+def _by_chance(differences: Array, level: float = 0.05) -> float:
+    count = len(differences)
+    return float(stdtrit(count - 1, 1 - level) * np.std(differences, ddof=1) / np.sqrt(count))
 
 
 def worse_than_nominal(judged_mm: Array, nominal_mm: Array, spent: float = 0.0, unit: str = "mm") -> list[Finding]:
