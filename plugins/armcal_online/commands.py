@@ -198,7 +198,7 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         if isinstance(to, int):
             journal.until(to)
         header, path = journal.header, journal.path
-    text = header.get("text", "").encode()
+    text = str(header.get("text", "")).encode()
     if hashlib.sha256(text).hexdigest() != header.get("calibration") or not isinstance(header.get("settings"), dict):
         hint = "Take another copy of the journal, or begin a new --out from its calibration.yaml."
         raise DataError("the journal does not hold its calibration whole.", where=Location(str(path)), hint=hint)

@@ -154,14 +154,15 @@ def check_reach(problem: Problem, dataset: Dataset) -> None:
                 where=replace(where, row=dataset.rows[first] if dataset.rows else None),
                 hint="Write all rows in the unit of the column names.",
             )
-        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) for x in (own.outputs[:3], measured))
-        if 1 / _REACH_RATIO <= distances / far <= _REACH_RATIO:
+        read = np.isfinite(measured).all(axis=0)
+        both = own.outputs[:3, read], measured[:, read]
+        far, distances = (float(np.median(np.linalg.norm(x, axis=0))) if read.any() else 0.0 for x in both)
+        if far <= _REACH_RATIO * distances and distances <= _REACH_RATIO * far:
             continue
         text = f"{name}: positions are typically {distances:.4g} m from the base frame, the model's tip {far:.4g} m"
         hint = "Check the unit in the column names (x_mm or x_m) and the frame of the measurements."
         modelled, spread = (
-            float(np.median(np.linalg.norm(x - np.median(x, axis=1, keepdims=True), axis=0)))
-            for x in (own.outputs[:3], measured)
+            float(np.median(np.linalg.norm(x - np.median(x, axis=1, keepdims=True), axis=0))) for x in both
         )
         if modelled and 1 / _ONE_UNIT < spread / modelled < _ONE_UNIT:
             if _can_be_placed(problem, number):
