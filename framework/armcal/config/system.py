@@ -277,12 +277,11 @@ def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettin
 def _part_names(source: ConfigSource, at: Path, kind: str, names: Collection[str], taken: Collection[str] = ()) -> None:
     """Names below an arm are parts of parameter names, which patterns match; dots and brackets have a meaning there."""
     for name in names:
-        where = source.where((*at, name))
         if not FIT_NAME.fullmatch(name) or not name.isprintable():
             text = f"found the {kind} name {name!r}, expected letters, digits, underscores and dashes."
-            raise ConfigError(text, where=where, hint="It becomes a part of parameters' names; patterns address them.")
+            source.refuse((*at, name), text, "It becomes a part of parameters' names; patterns address them.")
         if name in taken or list(names).count(name) > 1:
-            raise ConfigError(f"found the {kind} name {name!r}, which is taken.", where=where, hint="Rename one.")
+            source.refuse((*at, name), f"found the {kind} name {name!r}, which is taken.", "Rename one.")
 
 
 def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:

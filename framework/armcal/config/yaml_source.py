@@ -572,16 +572,12 @@ VARIANTS = ("study", "variants")  # Where a study lists its variants; the sectio
 _KEYS = ("extends", "set", "add")
 
 
-@dataclass(frozen=True)
-class Variants:
-    """A configuration with its variants' section, and every variant without it, in the order written."""
+def load_variants(
+    path: str | Path, overrides: Sequence[str] = (), listed: tuple[str, str] = VARIANTS
+) -> tuple[ConfigSource, dict[str, ConfigSource]]:
+    """A YAML config, and by name in the order written the variants that it lists, without their section.
 
-    base: ConfigSource
-    variants: dict[str, ConfigSource]
-
-
-def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple[str, str] = VARIANTS) -> Variants:
-    """Read the variants that a YAML config lists; without any, the config itself is the only one, called as the file.
+    Without any, the config itself is the only one, called as the file.
 
     A variant is the rest of the config, then what it ``extends`` (an earlier variant by its name, files), then the
     overrides, then the values that it sets (``set: {a.b: value}``) and the entries that it adds to lists
@@ -593,14 +589,12 @@ def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple
     for text in overrides:
         tree = override(tree, text)
     outside = [text for text in overrides if text.strip().partition("=")[0].partition(".")[0].strip() != listed[0]]
-    section = entries_of(tree).get(listed[0])
-    variants = entries_of(section).get(listed[1]) if section else None
+    alone, variants = _without(tree, listed[0]), _at(tree, listed)
     made: dict[str, Node] = {}
     for name, node in entries_of(variants).items() if variants else ():
-        made[str(name)] = _variant((*listed, str(name)), node, _without(tree, listed[0]), made, reader, outside)
-    made = made or {path.stem: _without(tree, listed[0])}
-    sources = {name: as_source(made[name], path, reader) for name in made}
-    return Variants(as_source(tree, path, reader), sources)
+        made[str(name)] = _variant((*listed, str(name)), node, alone, made, reader, outside)
+    made = made or {path.stem: alone}
+    return as_source(tree, path, reader), {name: as_source(node, path, reader) for name, node in made.items()}
 
 
 def _variant(
@@ -627,12 +621,12 @@ def _variant(
             value.origin.refuse(message, hint, value.line, (*at, "set"))
         tree = set_at(tree, steps, replace(value, origin=replace(value.origin, prefix=steps)))
     for steps, value in _by_path(entries.get("add"), (*at, "add")):
-        there = _at(tree, steps)
         more = value.value if isinstance(value.value, tuple) else (value,)
-        if there is not None and there.value is not None and not isinstance(there.value, tuple):
-            message = f"found {str(there.value)[:60]!r} at {'.'.join(steps)}, expected a list to add to."
+        there = _at(tree, steps)
+        kept = () if there is None or there.value is None else there.value
+        if not isinstance(kept, tuple):
+            message = f"found {str(kept)[:60]!r} at {'.'.join(steps)}, expected a list to add to."
             value.origin.refuse(message, "Use set: to replace it.", value.line)
-        kept = there.value if there is not None and isinstance(there.value, tuple) else ()
         own = replace(value, value=(*kept, *more), origin=replace(value.origin, prefix=steps))
         tree = set_at(tree, steps, own)
     return tree
@@ -661,8 +655,7 @@ def _at(tree: Node, steps: tuple[str, ...]) -> Node | None:
     """The node at a path; list entries count from 0."""
     there: Node | None = tree
     for step in steps:
-        if there is not None and isinstance(there.value, tuple):
-            there = dict(zip(map(str, range(len(there.value))), there.value, strict=True)).get(step)
-        else:
-            there = entries_of(there).get(step) if there else None
+        value = there.value if there else None
+        entries = {str(i): node for i, node in enumerate(value)} if isinstance(value, tuple) else value
+        there = entries.get(step) if isinstance(entries, dict) else None
     return there
