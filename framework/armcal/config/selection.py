@@ -1,7 +1,7 @@
 """Which parameters are free, between which bounds, under which priors."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -87,13 +87,12 @@ def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSo
 def without_groups(settings: ParameterSettings, instances: Collection[str]) -> ParameterSettings:
     """The settings less what they say of some instances, whose groups are not known before the records are."""
 
-    def of_others(patterns: Iterable[str]) -> list[str]:
-        return [pattern for pattern in patterns if pattern.partition(".")[0] not in instances]
+    def is_other(pattern: str) -> bool:
+        return pattern.partition(".")[0] not in instances
 
-    kept = {key: {p: getattr(settings, key)[p] for p in of_others(getattr(settings, key))} for key in _BY_NAME}
-    return settings.model_copy(
-        update={**kept, "free": tuple(of_others(settings.free)), "fixed": tuple(of_others(settings.fixed))}
-    )
+    globs = {key: tuple(filter(is_other, getattr(settings, key))) for key in ("free", "fixed")}
+    by_name = {key: {p: v for p, v in getattr(settings, key).items() if is_other(p)} for key in _BY_NAME}
+    return settings.model_copy(update=globs | by_name)
 
 
 def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, at: Path) -> float:

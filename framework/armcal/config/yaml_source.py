@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -426,11 +427,7 @@ def find_key(value: Any, step: Step) -> Step | None:
         return None
     if step in value:
         return step
-    for key in value:
-        split = split_suffix(key)
-        if split is not None and split[0] == step:
-            return str(key)
-    return None
+    return next((str(key) for key in value if (split := split_suffix(key)) is not None and split[0] == step), None)
 
 
 def load_config(
@@ -525,13 +522,8 @@ class Reader:
             kind = "a list" if isinstance(own.value, tuple) else f"the value {str(own.value)[:60]!r}"
             hint = "Write 'key: value' lines; put a space after each colon."
             origin.refuse(f"found {kind} at the top, expected keys and values.", hint, own.line)
-        merged: Node | None = None
-        for parent in parents_of(own):
-            base = self.parent(parent, (*chain, resolved))
-            merged = base if merged is None else merge(merged, base)
-        entries = {key: node for key, node in entries_of(own).items() if key != "extends"}
-        own = replace(own, value=entries)
-        self.done[resolved] = own if merged is None else merge(merged, own)
+        bases = [self.parent(parent, (*chain, resolved)) for parent in parents_of(own)]
+        self.done[resolved] = reduce(merge, [*bases, _without(own, "extends")])
         return self.done[resolved]
 
     def parent(self, text: ConfigText, chain: tuple[Path, ...]) -> Node:
@@ -569,7 +561,6 @@ def _scalar(node: Node, path: tuple[Step, ...]) -> Any:
 
 
 VARIANTS = ("study", "variants")  # Where a study lists its variants; the section is no part of any
-_KEYS = ("extends", "set", "add")
 
 
 def load_variants(
@@ -601,7 +592,7 @@ def _variant(
     at: tuple[str, str, str], node: Node, base: Node, earlier: dict[str, Node], reader: Reader, overrides: Sequence[str]
 ) -> Node:
     entries = entries_of(node)
-    unknown = sorted(set(entries) - set(_KEYS))
+    unknown = sorted(entries.keys() - {"extends", "set", "add"})
     if unknown or not (isinstance(node.value, dict) or node.value is None):
         message = f"found {', '.join(unknown) or str(node.value)[:60]!r} in a variant, expected extends, set or add."
         hint = f"Write for example {at[2]}: {{extends: FILE, set: {{parameters.bounds: none}}}}."
@@ -632,23 +623,21 @@ def _variant(
     return tree
 
 
-def _without(tree: Node, section: str) -> Node:
-    return replace(tree, value={key: node for key, node in entries_of(tree).items() if key != section})
+def _without(tree: Node, left_out: str) -> Node:
+    return replace(tree, value={key: node for key, node in entries_of(tree).items() if key != left_out})
 
 
-def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ...], Node]]:
+def _by_path(node: Node | None, at: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Node]]:
     if node is None or node.value is None:
-        return []
-    variants = []
+        return
     for name, value in entries_of(node).items():
         steps = steps_of(str(name))
         if steps is None or steps[0] in ("extends", at[0]):
             hint = "Write for example parameters.bounds: none."
             value.origin.refuse(f"found {name!r}, expected the dotted name of a value.", hint, value.line, at)
-        variants.append((steps, value))
+        yield steps, value
     if not isinstance(node.value, dict):
         node.origin.refuse("expected dotted names with values.", "Write NAME: value lines below it.", node.line, at)
-    return variants
 
 
 def _at(tree: Node, steps: tuple[str, ...]) -> Node | None:
