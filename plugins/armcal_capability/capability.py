@@ -194,7 +194,7 @@ def load_task(path: Path, rules: Path | None, overrides: Sequence[str], registry
             hint="Write extends: ARM.yaml in it, with the arm that the designs are of.",
         )
     designs = {}
-    for name, source in load_variants(config.path, overrides, listed=(SECTION, "designs")).variants.items():
+    for name, source in load_variants(config.path, overrides, listed=(SECTION, "designs"))[1].items():
         try:
             for key in set(source.data) - set(config.data):
                 source.refuse((key,), f"found {key!r}, expected the dotted name of a value of the arm.", _MEND)

@@ -16,10 +16,9 @@ from armcal.arm.joints import unknown_joint
 from armcal.base.settings import Settings
 from armcal.base.units import from_unit, split_suffix, units_of
 from armcal.devices.clock import Clock
-from armcal.devices.line_source import LineSource, SourceName, UdpLines, open_lines
+from armcal.devices.line_source import LOOPBACK, LineSource, SourceName, UdpLines, open_lines
 from armcal.devices.live import JointSample, JointStream
 from armcal.errors import ConfigError
-from armcal.io.lines import LOOPBACK
 from pydantic import Field, field_validator
 from typing_extensions import override
 

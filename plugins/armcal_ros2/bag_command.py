@@ -4,6 +4,8 @@ from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,6 @@ from armcal_ros2.reader import (
 
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_MOST_FRAMES = 200
 _LATEST = 20  # So many stamps of joint states are kept: transforms that are computed from them come at once
 
 
@@ -56,21 +57,17 @@ def survey(bag: Bag) -> tuple[dict[str, TopicSummary], dict[str, JointLog], list
         time = received / 1e9
         own = topics.setdefault(topic.name, TopicSummary(topic.type, time))
         own.last, own.first = max(own.last or time, time), min(own.first or time, time)
-        if topic.type == JOINT_STATE and not message.name:
-            continue
-        if topic.type == JOINT_STATE:
+        if topic.type == JOINT_STATE and message.name:
             if topic.name not in joints:
                 own_settings, slides = JointsSettings(topic=topic.name), [False] * len(message.name)
                 joints[topic.name] = JointLog(message.name, slides, own_settings, RestSettings())
             joints[topic.name].add(topic, message, received)
             stamps.append(nanoseconds(message.header.stamp) or -1)
-            continue
-        for part in message.transforms if topic.type == TRANSFORMS else [message]:
+        for part in getattr(message, "transforms", [message]) if topic.type in MEASURED else ():
             child = getattr(part, "child_frame_id", "")
             frame = f"{part.header.frame_id} -> {child}" if child else part.header.frame_id
-            if frame in own.frames or len(own.frames) < _MOST_FRAMES:
-                own.frames[frame] += 1
-                own.computed[frame] += int(bool(child) and nanoseconds(part.header.stamp) in stamps)
+            own.frames[frame] += 1
+            own.computed[frame] += int(bool(child) and nanoseconds(part.header.stamp) in stamps)
     for topic, count in bag.topics.items():
         topics.setdefault(topic.name, TopicSummary(topic.type)).count += count
     if not any(own.count for own in topics.values()):
@@ -88,15 +85,20 @@ def survey(bag: Bag) -> tuple[dict[str, TopicSummary], dict[str, JointLog], list
     return topics, joints, [*bag.remarks, *remarks]
 
 
+def _numbered(names: Sequence[str], ending: str = "") -> dict[str, str]:
+    """Names by joint (``q1`` and so on); empty where they are called so."""
+    numbered = {f"q{i}{ending}": name for i, name in enumerate(names, start=1)}
+    return {} if set(numbered) == set(names) else numbered
+
+
 def _data_section(path: Path, topics: Mapping[str, TopicSummary], joints: Mapping[str, JointLog]) -> dict[str, Any]:
     """One that would read it; empty without joint states."""
     if not joints:
         return {}
     topic, log = max(joints.items(), key=lambda entry: len(entry[1].rests))
-    section: dict[str, Any] = {"type": "rosbag2", "path": str(path), "joints": {"topic": topic}}
-    numbered = {f"q{i}": name for i, name in enumerate(log.names, start=1)}
-    if set(numbered) != set(log.names):
-        section["joints"]["names"] = numbered
+    names = _numbered(log.names)
+    stated = {"topic": topic, "names": names} if names else {"topic": topic}
+    section: dict[str, Any] = {"type": "rosbag2", "path": str(path), "joints": stated}
     measured: dict[str, dict[str, str]] = {}
     for name, summary in topics.items():
         if summary.type not in MEASURED or name.endswith("_static") or not summary.measured:
@@ -169,8 +171,9 @@ def images(
     require_new([table, information])
     out.mkdir(parents=True, exist_ok=True)
     stamps, written, infos = Stamps(seen, "header"), dict[int, str](), list[Any]()
-    for place, message in _nearest(recording, seen, rests, stamps, clock_offset_ms / 1000, infos):
-        suffix, picture = picture_of(message, seen)
+    candidates = _in_rests(recording, seen, rests, stamps, clock_offset_ms / 1000, infos)
+    for place, within in groupby(candidates, itemgetter(0)):  # only the nearest yet is held
+        suffix, picture = picture_of(min(within, key=itemgetter(1))[2], seen)
         written[place] = f"rest{place + 1:04d}{suffix}"
         write_new({out / written[place]: picture})
     remarks += stamps.check(str(path))
@@ -194,15 +197,14 @@ def images(
         }
         files[information] = yaml.safe_dump(camera, sort_keys=False).encode()
     write_new(files)
-    names = {f"q{i}_rad": f"{name}_rad" for i, name in enumerate(log.names, start=1)}
-    is_named = not {f"{name}_rad" for name in log.names} <= names.keys()
-    poses = {"type": "csv", "path": str(table), "columns": names} if is_named else str(table)
+    names = _numbered([f"{name}_rad" for name in log.names], "_rad")
+    poses = {"type": "csv", "path": str(table), "columns": names} if names else str(table)
     data = {"type": "images", "folder": str(out), "poses": poses}
     console.result({"images": [*written.values()], "files": [str(file) for file in files], "data": data})
     console.line(f"{len(written)} images written: {out}")
     for remark in remarks:
         console.warn(remark)
-    _show_data(console, data, is_named)
+    _show_data(console, data, bool(names))
 
 
 def _show_data(console: Console, data: dict[str, Any], named: bool) -> None:
@@ -220,29 +222,20 @@ def _only(path: Path, names: Sequence[str], stated: str | None, what: str, optio
     return chosen
 
 
-def _nearest(
+def _in_rests(
     bag: Bag, topic: str, rests: Sequence[JointRest], stamps: Stamps, offset: float, infos: list[Any]
-) -> Iterator[tuple[int, Any]]:
-    """The place of each rest with an image, and the image nearest to its middle; only one is held at a time."""
+) -> Iterator[tuple[int, float, Any]]:
+    """Each image in a rest: the rest's place, how far it is from the rest's middle (s), and the message."""
     begins, settle = [rest.begin for rest in rests], RestSettings().settle
     above = topic.removesuffix("/compressed").rpartition("/")[0]
-    held: tuple[int, float, Any] | None = None
     for own, received, _, message in bag.messages(lambda read: read.name in (topic, f"{above}/camera_info")):
         if own.type == _CAMERA_INFO:
             infos.append(message)
-            continue
-        time = stamps.time(nanoseconds(message.header.stamp), received)
-        place = -1 if time is None else bisect_right(begins, time - offset) - 1
-        if time is None or place < 0 or not begins[place] + settle <= time - offset <= rests[place].end - GUARD_S:
-            continue
-        away = abs(time - offset - (rests[place].begin + rests[place].end) / 2)
-        if held is not None and held[0] != place:
-            yield held[0], held[2]
-            held = None
-        if held is None or away < held[1]:
-            held = (place, away, message)
-    if held is not None:
-        yield held[0], held[2]
+        elif (stamp := stamps.time(nanoseconds(message.header.stamp), received)) is not None:
+            time = stamp - offset
+            place = bisect_right(begins, time) - 1
+            if place >= 0 and begins[place] + settle <= time <= rests[place].end - GUARD_S:
+                yield place, abs(time - (begins[place] + rests[place].end) / 2), message
 
 
 _MAGIC = {b"\xff\xd8": ".jpg", b"\x89PNG": ".png"}

@@ -28,12 +28,11 @@ from scipy.spatial.transform import Rotation
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _PURPOSE = "reading recordings of ROS 2"
-_MOST_DELAYS = 4096
 _ZERO, _SAME = "with the stamp zero", "with the stamp of the one before"
 _EARLIER = "with a stamp before that of an earlier one"
 # A larger part of the messages, and times are not to be trusted
 _MOST = {_ZERO: 0.5, _SAME: 0.5, _EARLIER: 0.01}
-Clock = Literal["header", "receive"]
+Clock = Literal["header", "receive"]  # Times are stamps of headers, or when the recorder received messages
 
 
 class Topic(NamedTuple):
@@ -41,19 +40,12 @@ class Topic(NamedTuple):
     type: str  # of its messages (``sensor_msgs/msg/JointState``)
 
 
-class TopicSettings(Settings):
-    """A topic, and what its times are: stamps of its headers, or when the recorder received its messages."""
-
-    topic: str | None = None
-    stamps: Clock = "header"
-
-
 class Stamps:
     """Times of one topic's messages, in order; those that cannot be are counted."""
 
     def __init__(self, topic: str, clock: Clock) -> None:
         self.topic, self.count = topic, 0
-        self._latest: float | None = None  # the last time (s since 1970)
+        self._latest = -math.inf  # the last time (s since 1970)
         self._clock = clock
         self.faults = Counter[str]()  # why messages are left out
         self._delays = array("d")
@@ -62,13 +54,12 @@ class Stamps:
         """Seconds since 1970 (arguments in ns); None where it is missing, repeated or before an earlier one."""
         self.count += 1
         chosen = stamp if self._clock == "header" else received
-        time, latest = chosen / 1e9, self._latest
-        if not chosen or (latest is not None and time <= latest):
-            self.faults[_ZERO if not chosen else _SAME if time == latest else _EARLIER] += 1
+        time = chosen / 1e9
+        if not chosen or time <= self._latest:
+            self.faults[_ZERO if not chosen else _SAME if time == self._latest else _EARLIER] += 1
             return None
         self._latest = time
-        if len(self._delays) < _MOST_DELAYS:
-            self._delays.append((received - chosen) / 1e9)
+        self._delays.append((received - chosen) / 1e9)
         return time
 
     @property
@@ -117,7 +108,7 @@ class Bag:
             refuse(path, f"found the ending {path.suffix or 'none'}, expected .mcap or .db3.", hint)
         for journal in path.glob("*.db3-wal"):
             if journal.stat().st_size:
-                self._remark(
+                self.remarks.append(
                     f"{journal.name} holds messages that are not read: its recorder was killed. To have them, run "
                     f"sqlite3 {journal.name.removesuffix('-wal')} 'pragma wal_checkpoint(truncate)'."
                 )
@@ -126,7 +117,7 @@ class Bag:
             if not files:
                 refuse(path, f"found no {_METADATA} and no file .mcap or .db3 in it.", _EXPECTED)
             self._files = sorted(files, key=lambda file: [int(n) for n in re.findall(r"\d+", file.name)])
-            self._remark(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
+            self.remarks.append(f"{_METADATA} is missing: the recorder was killed, or the file was not copied.")
 
     def messages(self, is_read: Callable[[Topic], bool]) -> Iterator[tuple[Topic, int, bytes, Any]]:
         """The messages of chosen topics, of each file by their time: when they were received (ns since 1970), their
@@ -154,11 +145,7 @@ class Bag:
                 text = f"it is cut off, damaged or no recording, after {count} messages ({said(fault)})."
                 refuse(file, text, f"{_EXPECTED} {_RECOVER}")
         for topic, lost in unread.items():
-            self._remark(f"{lost} messages of {topic.name} ({topic.type}) could not be decoded: left out.")
-
-    def _remark(self, text: str) -> None:
-        if text not in self.remarks:
-            self.remarks.append(text)
+            self.remarks.append(f"{lost} messages of {topic.name} ({topic.type}) could not be decoded: left out.")
 
 
 GUARD_S = 0.1  # At the end of a rest, before joints are seen to move
@@ -169,13 +156,15 @@ _JUMP, _MOST_RETURNS = 20.0, 0.1
 """A larger part of messages that jump by so many spreads, to where the joints just were: two programs publish them."""
 
 
-class JointsSettings(TopicSettings):
+class JointsSettings(Settings):
     """Where joint angles come from.
 
     ``names`` maps joints of the arm (``q1``, with several arms ``left.q1``) to those of the recording; others have
     their own name there. ``unit`` is rad as ROS has it, or deg where the driver errs.
     """
 
+    topic: str | None = None
+    stamps: Clock = "header"
     names: dict[str, str] = Field(default_factory=dict)
     unit: Literal["rad", "deg"] = "rad"
 
@@ -306,7 +295,7 @@ _MOST_OTHERS = 0.01
 _FEWEST_SAMPLES = 4
 
 
-class MeasuredSettings(TopicSettings):
+class MeasuredSettings(Settings):
     """Where a measurement comes from.
 
     ``topic`` is one of PoseStamped, PointStamped or TransformStamped; ``frame`` is then the frame_id that its headers
@@ -316,6 +305,7 @@ class MeasuredSettings(TopicSettings):
     """
 
     topic: str
+    stamps: Clock = "header"
     frame: str | None = None
     reference: str | None = None
     inverted: bool = False
@@ -345,7 +335,7 @@ class MeasuredLog:
         self.instance, self.settings = instance, settings
         self.stamps = Stamps(settings.topic, settings.stamps)
         self.types = tuple(_FIELDS) if settings.reference is None else (TRANSFORMS,)
-        self._samples = array("d")  # 8 each: s, m, quaternion xyzw
+        self._samples = array("d")  # 13 each: s, and the upper rows of the pose (m)
         # the newest transforms, by child frame: parent, pose in it (4 x 4, m) and time (None: always)
         self._edges: dict[str, tuple[str, Array, float | None]] = {}
         self._frames = Counter[str]()
@@ -363,12 +353,10 @@ class MeasuredLog:
         if self.settings.frame not in (None, message.header.frame_id):
             return
         time = self.stamps.time(nanoseconds(message.header.stamp), received)
-        if time is None:
-            return
-        body, position, orientation = _FIELDS[topic.type]
-        content = getattr(message, body) if body else message
-        p, q = getattr(content, position), getattr(content, orientation) if orientation else None
-        self._take(time, np.array([p.x, p.y, p.z]), None if q is None else np.array([q.x, q.y, q.z, q.w]))
+        if time is not None:
+            body, position, orientation = _FIELDS[topic.type]
+            content = getattr(message, body) if body else message
+            self._keep(time, self._pose(getattr(content, position), getattr(content, orientation, None)))
 
     def close(self, place: str, types: Mapping[str, str]) -> list[str]:
         """What was left out, sentences; refused if nothing was measured, or not in the frames that were asked for.
@@ -403,40 +391,34 @@ class MeasuredLog:
             remarks.append(f"{others} messages of {s.topic} have other frames than {usual!r}.")
         return remarks
 
-    def seen(self, rests: Sequence[JointRest], still: RestSettings) -> list[_Seen]:
-        samples, offset = np.array(self._samples).reshape(-1, 8), self.settings.clock_offset
+    def seen(self, rests: Sequence[JointRest], still: RestSettings) -> Iterator[_Seen]:
+        samples, offset = np.array(self._samples).reshape(-1, 13), self.settings.clock_offset
         spans = np.array([(rest.begin + still.settle, rest.end - GUARD_S) for rest in rests]) + offset
-        return [self._seen(samples[slice(*span)], still.drift) for span in np.searchsorted(samples[:, 0], spans)]
-
-    def _seen(self, rows: Array, drift: float) -> _Seen:
-        nothing = np.full((4, 4), np.nan)
-        if len(rows) < _FEWEST_SAMPLES:
+        for span in np.searchsorted(samples[:, 0], spans):
+            rows = samples[slice(*span), 1:]
+            poses = np.tile(np.eye(4), (len(rows), 1, 1))
+            poses[:, :3] = rows.reshape(-1, 3, 4)
             fault = f"no measurement ({len(rows)} samples, at least {_FEWEST_SAMPLES})"
-            return _Seen(nothing, samples=len(rows), fault=fault)
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3, 3] = rows[:, 1:4]
-        is_point = bool(np.isnan(rows[0, 4]))
-        poses[:, :3, :3] = np.nan if is_point else Rotation.from_quat(rows[:, 4:]).as_matrix()
-        stillness = judged(poses, drift)
-        if stillness.why_not:
-            return _Seen(nothing, samples=len(rows), fault=stillness.why_not)
-        kept = poses[stillness.kept]
-        mean = mean_pose(kept)
-        return _Seen(mean, float(np.linalg.norm(deviations_of_mean(kept, mean)[:3])), len(kept))
+            if len(rows) >= _FEWEST_SAMPLES:
+                stillness = judged(poses, still.drift)
+                poses, fault = poses[stillness.kept], stillness.why_not
+            if fault:
+                yield _Seen(np.full((4, 4), np.nan), samples=len(rows), fault=fault)
+                continue
+            mean = mean_pose(poses)
+            yield _Seen(mean, float(np.linalg.norm(deviations_of_mean(poses, mean)[:3])), len(poses))
 
     def _follow(self, message: Any, received: int, is_static: bool) -> None:
         s, changed = self.settings, set[str]()
         for part in message.transforms:
-            q = part.transform.rotation
-            if not abs(math.hypot(q.x, q.y, q.z, q.w) - 1) <= _NORM_TOLERANCE:
-                self.stamps.faults["whose quaternion is not of length 1"] += 1
-                continue
-            at = (nanoseconds(part.header.stamp) if s.stamps == "header" else received) / 1e9
-            pose, place, child = np.eye(4), part.transform.translation, part.child_frame_id.lstrip("/")
-            pose[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            pose[:3, 3] = (place.x, place.y, place.z)
-            self._edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
-            changed.add(child)
+            pose, child = (
+                self._pose(part.transform.translation, part.transform.rotation),
+                part.child_frame_id.lstrip("/"),
+            )
+            if pose is not None:
+                at = (nanoseconds(part.header.stamp) if s.stamps == "header" else received) / 1e9
+                self._edges[child] = (part.header.frame_id.lstrip("/"), pose, None if is_static else at)
+                changed.add(child)
         above, beside = self._above(s.frame or ""), self._above(s.reference or "")
         between = {*above} ^ {*beside}  # what is above both does not matter
         if above[-1] != beside[-1] or changed.isdisjoint(between):
@@ -453,8 +435,7 @@ class MeasuredLog:
                 reduce(lambda pose, name: self._edges[name][1] @ pose, names[:-1], np.eye(4))
                 for names in (above, beside)
             )
-            pose = np.linalg.inv(reference) @ in_root
-            self._take(time, pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat())
+            self._keep(time, np.linalg.inv(reference) @ in_root)
 
     def _above(self, frame: str) -> list[str]:
         """A frame, its parent, and so on to the root."""
@@ -463,23 +444,26 @@ class MeasuredLog:
             names.append(self._edges[names[-1]][0])
         return names
 
-    def _take(self, time: float, position: Array, turn: Array | None) -> None:
-        if not np.isfinite(position).all():
-            self.stamps.faults["whose position is not finite"] += 1
-            return
-        if turn is None:
-            if self.settings.inverted:
-                self.stamps.faults["whose orientation is missing, so that they have no inverse"] += 1
-                return
-            turn = np.full(4, np.nan)
-        elif not abs((norm := float(np.linalg.norm(turn))) - 1) <= _NORM_TOLERANCE:
-            what = "is zero" if norm < _NORM_TOLERANCE else "is not of length 1"
-            self.stamps.faults[f"whose quaternion {what}"] += 1
-            return
-        elif self.settings.inverted:
-            inverse = Rotation.from_quat(turn).inv()
-            position, turn = -inverse.apply(position), inverse.as_quat()
-        self._samples.extend((time, *position.tolist(), *turn.tolist()))
+    def _pose(self, p: Any, q: Any) -> Array | None:
+        """4 x 4 (m), of a point with a rotation of NaN; None, and counted, where it cannot be."""
+        pose, fault, norm = np.eye(4), "", 1.0 if q is None else math.hypot(q.x, q.y, q.z, q.w)
+        pose[:3, 3] = p.x, p.y, p.z
+        if not np.isfinite(pose).all():
+            fault = "whose position is not finite"
+        elif q is None and self.settings.inverted:
+            fault = "whose orientation is missing, so that they have no inverse"
+        elif not abs(norm - 1) <= _NORM_TOLERANCE:
+            fault = f"whose quaternion is {'zero' if norm < _NORM_TOLERANCE else 'not of length 1'}"
+        if fault:
+            self.stamps.faults[fault] += 1
+            return None
+        pose[:3, :3] = np.nan if q is None else Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
+        return pose
+
+    def _keep(self, time: float, pose: Array | None) -> None:
+        if pose is not None:
+            rows = (np.linalg.inv(pose) if self.settings.inverted else pose)[:3]
+            self._samples.extend((time, *rows.ravel().tolist()))
 
 
 _FEWEST = 26  # Twice the numbers of an affine map of the tool's pose
@@ -492,11 +476,10 @@ def is_inverted(tools: Array, poses: Array) -> bool:
     if turned.sum() < _FEWEST:
         return False
     design = np.column_stack([np.ones(turned.sum()), tools[turned, :3].reshape(-1, 12)])
-    off = []
-    for places in (np.linalg.inv(poses[turned])[:, :3, 3], poses[turned, :3, 3]):
-        remaining = places - design @ np.linalg.lstsq(design, places, rcond=None)[0]
-        off.append(float(np.sqrt((remaining**2).mean())))
-    return _MUCH_BETTER * off[0] < off[1]
+    places = np.hstack([np.linalg.inv(poses[turned])[:, :3, 3], poses[turned, :3, 3]])
+    remaining = places - design @ np.linalg.lstsq(design, places, rcond=None)[0]
+    inverse, direct = np.linalg.norm(remaining[:, :3]), np.linalg.norm(remaining[:, 3:])
+    return bool(_MUCH_BETTER * inverse < direct)
 
 
 _CLOCKS_APART_S = 0.5
@@ -570,8 +553,8 @@ class Rosbag2Reader:
         channels = {}
         for arm, model in request.arms.items():
             for joint in model.commanded:
-                own = names.get(f"{arm}.{joint}", names.get(joint) if alone else None)
-                channels[f"{arm}.{joint}"] = own or joint
+                channel = f"{arm}.{joint}"
+                channels[channel] = names.get(channel, names.get(joint) if alone else None) or joint
         strange = [name for name in names if name not in channels and alone + name not in channels]
         if strange:
             have = ", ".join(name.removeprefix(alone) for name in channels)
@@ -593,7 +576,7 @@ class Rosbag2Reader:
         channels["time"] = np.array([(rest.begin + rest.end) / 2 for rest in rests])
         extra = {"rest_s": tuple(f"{rest.end - rest.begin:.3f}" for rest in rests)}
         extra["joint_scatter"] = tuple(f"{rest.scatter.max():.2g}" for rest in rests)
-        seen = {log.instance: log.seen(rests, still) for log in logs}
+        seen = {log.instance: [*log.seen(rests, still)] for log in logs}
         for log in logs:
             name, own = log.instance, seen[log.instance]
             channels |= self._measured(name, request, own)
@@ -643,11 +626,10 @@ class Rosbag2Reader:
         """The channels of a measurement, NaN where it saw nothing."""
         poses = np.array([one.pose for one in seen])
         turned = np.isfinite(poses[:, 0, 0])
-        values = {axis: poses[:, i, 3] for i, axis in enumerate("xyz")}
-        quaternions = np.full((len(poses), 4), np.nan)
+        rows = np.column_stack([poses[:, :3, 3], np.full((len(poses), 4), np.nan)])
         if turned.any():
-            quaternions[turned] = Rotation.from_matrix(poses[turned, :3, :3]).as_quat(canonical=True)
-        values |= {axis: quaternions[:, i] for i, axis in enumerate(("qx", "qy", "qz", "qw"))}
+            rows[turned, 3:] = Rotation.from_matrix(poses[turned, :3, :3]).as_quat(canonical=True)
+        values = dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), rows.T, strict=True))
         needed = [channel.name for channel in request.measurements[name].channels()]
         lacking = [own for own in needed if own not in values]
         if lacking:

@@ -37,10 +37,9 @@ from armcal.base.settings import Settings
 from armcal.base.units import from_unit
 from armcal.devices.clock import Clock
 from armcal.devices.device import DeviceRefusedError
-from armcal.devices.line_source import UdpLines
+from armcal.devices.line_source import UdpLines, bound
 from armcal.devices.live import REPEATED, Tracker, TrackerFrame
-from armcal.errors import InputError, Location
-from armcal.io.lines import bound
+from armcal.errors import Location
 from pydantic import AfterValidator, Field, field_validator
 from typing_extensions import override
 
@@ -213,7 +212,6 @@ def _dtrack_numbers(text: str, count: int, name: str) -> list[float]:
 _DAY_S = 86400.0
 _MOST_BYTES = 65536
 _MOST_AT_ONCE = 10_000  # Datagrams; the rest waits in the system's queue, which holds some 0.2 MB or more
-_BUFFER_BYTES = 4 * 1024**2
 
 
 def _address(value: str) -> str:
@@ -269,14 +267,13 @@ class DTrackTracker(_CountingTracker):
         try:
             opened = bound(s.host, s.port)
             try:
-                opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
                 if s.group is not None:
                     member = socket.inet_aton(s.group) + socket.inet_aton("0.0.0.0" if s.host == s.group else s.host)
                     opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
             except OSError:
                 opened.close()
                 raise
-        except (OSError, InputError) as fault:
+        except OSError as fault:
             raise DeviceRefusedError(
                 f"the port cannot be opened ({fault}).",
                 where=Location(f"udp:{s.host}:{s.port}"),

@@ -144,7 +144,7 @@ def test_a_prediction_without_the_payload_its_calibration_had_is_refused(tmp_pat
 
     refused(predict(CONFIGS / "demo.csv"), "demo.csv", "payload is not stated", "payload_g")
     assert predict(loaded).exit_code == 0
-    refused(check("statics.payload_g=-5"), "payload", "below zero")
+    refused(check("statics.payload_g=-5"), "payload", "found -5", "greater than or equal to 0")
 
 
 @pytest.mark.slow

@@ -117,8 +117,8 @@ def in_the_models_terms(loop: Loop, joint: int) -> np.ndarray:
 def truth(loop: Loop) -> dict[str, float]:
     """Every free parameter's true value, as the model has it."""
     experiment = loop.experiment()
-    texts = dict(load_config(CONFIGS / "truth.yaml").data)
-    parameters = with_values(experiment.parameters, texts, None, ())
+    source = load_config(CONFIGS / "truth.yaml")
+    parameters = with_values(experiment.parameters, source.data, source, ())
     found = dict(zip(parameters.entry_names, parameters.nominal().tolist(), strict=True))
     for i in range(1, 7):
         offset, above, below = in_the_models_terms(loop, i)

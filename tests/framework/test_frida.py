@@ -148,9 +148,11 @@ def test_a_run_tells_what_is_determined_and_names_the_rest(name, tmp_path):
 
 
 def test_entries_of_an_axis_are_plain_numbers_in_si_or_have_a_unit():
-    parameters = Case.load("dual_twists").experiment.parameters
+    experiment = Case.load("dual_twists").experiment
+    parameters = experiment.parameters
     plain, stated = (
-        with_values(parameters, {"left.poe.axis1[vx]": text}, None, ()).nominal() for text in (-0.0049, "-4.9 mm")
+        with_values(parameters, {"left.poe.axis1[vx]": text}, experiment.source, ()).nominal()
+        for text in (-0.0049, "-4.9 mm")
     )
     np.testing.assert_allclose(plain, stated, rtol=1e-12)
     assert not np.array_equal(plain, parameters.nominal())

@@ -66,16 +66,16 @@ def _variants(place: Path, section: str, *overrides: str):
 
 
 def test_a_variant_is_the_whole_configuration_with_its_own_over_it(place: Path) -> None:
-    read = _variants(
+    base, read = _variants(
         place,
         "    plain:\n"
         "    whole: {extends: option1.yaml}\n"
         "    free: {extends: whole, set: {parameters.bounds: none, statics.payload_g: 12, estimator.seed: 3}}\n"
         "    more: {extends: [free], add: {parameters.free: [arm.mdh.d3, arm.mdh.d6], parameters.fixed: arm.mdh.d4}}\n",
     )
-    data = {name: source.data for name, source in read.variants.items()}
+    data = {name: source.data for name, source in read.items()}
     assert list(data) == ["plain", "whole", "free", "more"]
-    assert "study" in read.base.data and not any("study" in each for each in data.values())
+    assert "study" in base.data and not any("study" in each for each in data.values())
     assert "parameters" not in data["plain"] and data["plain"]["estimator"]["type"] == "cvxpy"
     option1 = Experiment.load(place / "option1.yaml").source.data
     assert data["whole"]["parameters"] == option1["parameters"] and data["whole"]["arms"] == option1["arms"]
@@ -84,8 +84,8 @@ def test_a_variant_is_the_whole_configuration_with_its_own_over_it(place: Path) 
     assert data["more"]["parameters"]["free"] == [*option1["parameters"]["free"], "arm.mdh.d3", "arm.mdh.d6"]
     assert data["more"]["parameters"]["fixed"] == ["arm.mdh.d4"]
     assert data["free"]["parameters"]["free"] == option1["parameters"]["free"], "adding changed what was extended"
-    assert read.variants["free"].where(("parameters", "bounds")).file == str(place / "study.yaml")
-    assert read.variants["more"].where(("parameters", "free", 0)).file == str(place / "option1.yaml")
+    assert read["free"].where(("parameters", "bounds")).file == str(place / "study.yaml")
+    assert read["more"].where(("parameters", "free", 0)).file == str(place / "option1.yaml")
 
 
 def test_a_file_lies_over_the_study_and_the_command_line_over_the_file_and_what_a_variant_sets_over_both(
@@ -96,20 +96,20 @@ def test_a_file_lies_over_the_study_and_the_command_line_over_the_file_and_what_
         "    own: {extends: option1.yaml, set: {estimator.type: ipopt, estimator.starts: 2}}\n"
         "    gone: {extends: option1.yaml, set: {parameters: null}}\n"
     )
-    assert _variants(place, section).variants["file"].data["estimator"]["type"] == "ipopt"
-    read = _variants(place, section, "estimator.type=kalman", "study.folds=4", "parameters.free.0=arm.mdh.d6")
-    assert read.base.data["study"]["folds"] == 4
-    assert read.variants["file"].data["estimator"]["type"] == "kalman"
-    assert read.variants["file"].data["parameters"]["free"][0] == "arm.mdh.d6"
-    assert read.variants["own"].data["estimator"] == {"type": "ipopt", "starts": 2}
-    assert "parameters" not in read.variants["gone"].data
+    assert _variants(place, section)[1]["file"].data["estimator"]["type"] == "ipopt"
+    base, read = _variants(place, section, "estimator.type=kalman", "study.folds=4", "parameters.free.0=arm.mdh.d6")
+    assert base.data["study"]["folds"] == 4
+    assert read["file"].data["estimator"]["type"] == "kalman"
+    assert read["file"].data["parameters"]["free"][0] == "arm.mdh.d6"
+    assert read["own"].data["estimator"] == {"type": "ipopt", "starts": 2}
+    assert "parameters" not in read["gone"].data
 
 
 def test_the_command_line_does_not_undo_what_an_extended_variant_set(place: Path) -> None:
     section = "    one: {extends: option1.yaml, set: {parameters.free: [arm.mdh.d6]}}\n    two: {extends: one}\n"
-    read = _variants(place, section, "parameters.free=[arm.mdh.d5]")
-    assert read.variants["one"].data["parameters"]["free"] == ["arm.mdh.d6"]
-    assert read.variants["two"].data["parameters"]["free"] == ["arm.mdh.d6"]
+    _, read = _variants(place, section, "parameters.free=[arm.mdh.d5]")
+    assert read["one"].data["parameters"]["free"] == ["arm.mdh.d6"]
+    assert read["two"].data["parameters"]["free"] == ["arm.mdh.d6"]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_the_command_line_does_not_undo_what_an_extended_variant_set(place: Path
 )
 def test_a_variant_that_cannot_be_is_refused_in_its_own_words(place: Path, section: str, says: list[str]) -> None:
     if not says:
-        assert _variants(place, section).variants["a"].data["name"] == {"inner": 3}
+        assert _variants(place, section)[1]["a"].data["name"] == {"inner": 3}
         return
     with pytest.raises(ConfigError) as caught:
         _variants(place, section)

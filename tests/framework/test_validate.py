@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
 from armcal.base.settings import Length, Settings
 from armcal.config.validate import validate
 from armcal.errors import ConfigError
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from settings_samples import GOOD, Experiment, Mdh, Poe, Row, check, load
 
 
@@ -122,15 +123,17 @@ def test_a_part_below_a_path_keeps_its_full_place(tmp_path: Path) -> None:
         validate(Row, source, ("model", "rows"))
 
 
-def test_an_untagged_union_reports_only_the_member_that_was_meant(tmp_path: Path) -> None:
+def test_of_a_union_only_the_members_that_have_the_shape_of_the_value_are_reported(tmp_path: Path) -> None:
     class Holder(Settings):
-        part: Mdh | Poe | Length
+        part: Annotated[Mdh | Poe, Field(discriminator="type")] | Length
+        joints: Literal["all"] | tuple[str, ...]
 
-    text = "part:\n  type: poe\n  axes_mm: [[0, 0, 1]]\n  rows: []\n"
+    text = "part:\n  type: poe\n  axes_mm: [[0, 0, 1]]\n  rows: []\njoints: [q1, 2]\n"
     with pytest.raises(ConfigError) as caught:
         validate(Holder, load(tmp_path, text))
-    assert str(caught.value).startswith(f"{tmp_path / 'c.yaml'}:4, part.rows: found the unknown key 'rows'")
-    assert "\n" not in str(caught.value)
+    first, second, _ = str(caught.value).splitlines()
+    assert first.startswith(f"{tmp_path / 'c.yaml'}:4, part.rows: found the unknown key 'rows'")
+    assert second.startswith(f"{tmp_path / 'c.yaml'}:5, joints.1: found 2, expected text")
 
 
 def test_a_check_of_the_plugin_itself_is_placed_at_its_part(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Which parameters are free, between which bounds, under which priors."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -72,13 +72,13 @@ def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSo
                 hint = "Let free numbers drift: add it to parameters.free, under a prior if need be."
                 source.refuse(place, why, hint)
             deviation = _deviation(block, stated.sd, source, (*place, "sd"))
-            where = source.where((*place, "over"))
             try:
                 over = parse_quantity(stated.over, "time") if isinstance(stated.over, str) else float(stated.over)
             except ValueError as fault:
-                raise ConfigError(f"{fault}", where=where, hint="Write records (10) or a time (20 min).") from fault
+                where, hint = source.where((*place, "over")), "Write records (10) or a time (20 min)."
+                raise ConfigError(f"{fault}", where=where, hint=hint) from fault
             if not over > 0 or not math.isfinite(over):
-                raise ConfigError(f"found {stated.over}, expected a distance above zero.", where=where)
+                source.refuse((*place, "over"), f"found {stated.over}, expected a distance above zero.")
             drift = Drift(deviation, over, "time" if isinstance(stated.over, str) else "sequence")
             parameters = parameters.replaced({name: replace(block, drift=drift)})
     return parameters
@@ -87,13 +87,12 @@ def select(parameters: Parameters, settings: ParameterSettings, source: ConfigSo
 def without_groups(settings: ParameterSettings, instances: Collection[str]) -> ParameterSettings:
     """The settings less what they say of some instances, whose groups are not known before the records are."""
 
-    def of_others(patterns: Iterable[str]) -> list[str]:
-        return [pattern for pattern in patterns if pattern.partition(".")[0] not in instances]
+    def is_other(pattern: str) -> bool:
+        return pattern.partition(".")[0] not in instances
 
-    kept = {key: {p: getattr(settings, key)[p] for p in of_others(getattr(settings, key))} for key in _BY_NAME}
-    return settings.model_copy(
-        update={**kept, "free": tuple(of_others(settings.free)), "fixed": tuple(of_others(settings.fixed))}
-    )
+    globs = {key: tuple(filter(is_other, getattr(settings, key))) for key in ("free", "fixed")}
+    by_name = {key: {p: v for p, v in getattr(settings, key).items() if is_other(p)} for key in _BY_NAME}
+    return settings.model_copy(update=globs | by_name)
 
 
 def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, at: Path) -> float:
@@ -105,21 +104,20 @@ def _deviation(block: ParameterBlock, text: str | float, source: ConfigSource, a
 
 
 def with_values(
-    parameters: Parameters, values: Mapping[str, str | float], source: ConfigSource | None, at: Path
+    parameters: Parameters, values: Mapping[str, str | float], source: ConfigSource, at: Path
 ) -> Parameters:
     """Other nominal values by exact name, as text with a unit; a matrix by its entries (``arm.flex.C3[xx]``)."""
     changed: dict[str, Path] = {}
     for name, text in values.items():
         place = (*at, name)
-        where = source.where(place) if source else None
         owner = name.partition("[")[0]
         if owner not in parameters.names:
             hint = f"Give each its own: {', '.join(_matching(parameters, name, source, place))}."
-            raise ConfigError(f"{name} stands for several names: a value is of one parameter.", where=where, hint=hint)
+            source.refuse(place, f"{name} stands for several names: a value is of one parameter.", hint)
         block = parameters[owner]
         if name not in block.entry_names:
             hint = f"Give its entries, each on its own: {', '.join(block.entry_names)}."
-            raise ConfigError(f"{name} is no single number.", where=where, hint=hint)
+            source.refuse(place, f"{name} is no single number.", hint)
         numbers = list(block.nominal)
         i = block.entry_names.index(name)
         is_plain = not isinstance(text, str) and DIMENSION_OF_UNIT.get(block.unit) in (None, DIMENSIONLESS)
@@ -129,7 +127,7 @@ def with_values(
         changed[owner] = place
     for owner, place in changed.items():
         if fault := parameters[owner].domain.check(np.array(parameters[owner].nominal)):
-            raise ConfigError(f"{owner}: {fault}.", where=source.where(place) if source else None)
+            source.refuse(place, f"{owner}: {fault}.")
     return parameters
 
 
@@ -150,9 +148,8 @@ def quantity(block: ParameterBlock, text: str | float, source: ConfigSource | No
         raise ConfigError(f"{block.name}: {fault}", where=where) from fault
 
 
-def _matching(parameters: Parameters, glob: str, source: ConfigSource | None, at: Path) -> tuple[str, ...]:
+def _matching(parameters: Parameters, glob: str, source: ConfigSource, at: Path) -> tuple[str, ...]:
     try:
         return parameters.select([glob])
     except ConfigError as fault:
-        where = source.where(at) if source else None
-        raise ConfigError(fault.message, where=where, hint=fault.hint) from fault
+        raise ConfigError(fault.message, where=source.where(at), hint=fault.hint) from fault

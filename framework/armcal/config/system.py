@@ -5,9 +5,9 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pkgutil import resolve_name
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, field_validator
+from pydantic import Field
 from typing_extensions import get_protocol_members, is_protocol
 
 from armcal.arm.assembly import PLACEMENT, Arm, MassiveModel, prefixed
@@ -38,7 +38,7 @@ class LinkSettings(Settings):
     carry it (from 1; 0 for the mount alone).
     """
 
-    mass: Mass
+    mass: Annotated[Mass, Field(ge=0)]
     com: Length3
     frame: str
     loads_up_to_joint: int | None = None
@@ -71,17 +71,10 @@ class StaticsSettings(Settings):
 
     gravity: Acceleration3 | None = None
     body: Literal["earth", "moon", "mars"] | None = None
-    payload: Mass | None = None
+    payload: Annotated[Mass, Field(ge=0)] | None = None
     payload_com: Length3 = (0.0, 0.0, 0.0)
     force: Force3 = (0.0, 0.0, 0.0)
     torque: Torque3 = (0.0, 0.0, 0.0)
-
-    @field_validator("payload")
-    @classmethod
-    def _not_negative(cls, value: float | None) -> float | None:
-        if value is not None and value < 0:
-            raise ValueError(f"a payload of {value * 1000:g} g is below zero")
-        return value
 
 
 class SystemSettings(Settings):
@@ -115,9 +108,7 @@ class System:
         blocks: list[ParameterBlock] = [block for arm in self.arms.values() for block in arm.parameters()]
         for name, measurement in self.measurements.items():
             blocks += prefixed(f"{name}.", declared(measurement))
-        blocks += gravity_tilt()
-        blocks += group_blocks(self.measurements, groups or {})
-        return Parameters(tuple(blocks))
+        return Parameters((*blocks, *gravity_tilt(), *group_blocks(self.measurements, groups or {})))
 
 
 def build_system(source: ConfigSource, registry: PluginRegistry) -> System:
@@ -260,8 +251,6 @@ def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettin
         if link.frame not in known:
             text = f"no frame is called {link.frame!r}."
             source.refuse((*place, "frame"), text, f"The frames are {', '.join(known)}.")
-        if link.mass < 0:
-            source.refuse((*place, "mass"), "found a mass below zero.", "Give the mass.")
         if link.loads_up_to_joint is not None and not 0 <= link.loads_up_to_joint <= joints:
             text = f"found joint {link.loads_up_to_joint}, expected 0 to {joints}."
             source.refuse((*place, "loads_up_to_joint"), text, "Joints count from 1; 0 is the mount.")
@@ -277,12 +266,11 @@ def _check_masses(source: ConfigSource, at: Path, links: Mapping[str, LinkSettin
 def _part_names(source: ConfigSource, at: Path, kind: str, names: Collection[str], taken: Collection[str] = ()) -> None:
     """Names below an arm are parts of parameter names, which patterns match; dots and brackets have a meaning there."""
     for name in names:
-        where = source.where((*at, name))
         if not FIT_NAME.fullmatch(name) or not name.isprintable():
             text = f"found the {kind} name {name!r}, expected letters, digits, underscores and dashes."
-            raise ConfigError(text, where=where, hint="It becomes a part of parameters' names; patterns address them.")
+            source.refuse((*at, name), text, "It becomes a part of parameters' names; patterns address them.")
         if name in taken or list(names).count(name) > 1:
-            raise ConfigError(f"found the {kind} name {name!r}, which is taken.", where=where, hint="Rename one.")
+            source.refuse((*at, name), f"found the {kind} name {name!r}, which is taken.", "Rename one.")
 
 
 def _refusable(source: ConfigSource, at: Path, build: Callable[[], T]) -> T:

@@ -34,8 +34,7 @@ class _Finding:
     """One of pydantic's errors, placed in the config."""
 
     path: tuple[Step, ...]
-    branches: tuple[tuple[tuple[Step, ...], str], ...]  # the union members it is under, each with the union's path
-    kind: str
+    unions: tuple[tuple[Step, ...], ...]  # the paths of those that it is under
     value: str
     expected: str
     mend: str
@@ -81,7 +80,7 @@ def validate(
 def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
     kind, refused = str(error["type"]), error["input"]
     path: list[Step] = []
-    branches: list[tuple[tuple[Step, ...], str]] = []
+    unions: list[tuple[Step, ...]] = []
     value, is_fault = raw, isinstance(refused, Fault)
     loc: Sequence[Step] = error["loc"]
     for index, step in enumerate(loc):
@@ -96,7 +95,7 @@ def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
         ):  # a key or an index of the value, not a union member
             path.append(step)
         else:
-            branches.append((tuple(path), str(step)))
+            unions.append(tuple(path))
     shown, expected, mend, message = _shown(value, refused), "", "", ""
     text, context = str(error["msg"]), error.get("ctx", {})
     if isinstance(refused, Fault):
@@ -124,7 +123,7 @@ def _finding(error: Mapping[str, Any], raw: Any) -> _Finding:
     else:
         expected = text.removeprefix("Input should be ")
         expected, mend = expected[:1].lower() + expected[1:], "correct it"
-    return _Finding(tuple(path), tuple(branches), kind, shown, expected, mend, message)
+    return _Finding(tuple(path), tuple(unions), shown, expected, mend, message)
 
 
 def _nearest(value: Any, choices: str) -> str:
@@ -148,32 +147,13 @@ def _shown(value: Any, refused: Any) -> str:
 
 
 def _settle(findings: Sequence[_Finding]) -> list[_Finding]:
-    """Keep, of each union, the member that was meant; then one finding for each place."""
-    kept = list(findings)
-    for depth in range(max((len(f.branches) for f in findings), default=0)):
-        unions: dict[tuple[Step, ...], list[_Finding]] = {}
-        for finding in kept:
-            if len(finding.branches) > depth:
-                unions.setdefault(finding.branches[depth][0], []).append(finding)
-        dropped = {id(f) for path, members in unions.items() for f in _not_meant(path, members, depth)}
-        kept = [f for f in kept if id(f) not in dropped]
+    """Of each union what is wrong within the value, if a member has its shape; then one finding for each place."""
+    entered = {union for finding in findings for union in finding.unions if len(finding.path) > len(union)}
     places: dict[tuple[Step, ...], list[_Finding]] = {}
-    for finding in kept:
-        places.setdefault(finding.path, []).append(finding)
-    return [merged for same in places.values() for merged in _merged(same)]
-
-
-def _not_meant(path: tuple[Step, ...], findings: Sequence[_Finding], depth: int) -> list[_Finding]:
-    members: dict[str, list[_Finding]] = {}
     for finding in findings:
-        members.setdefault(finding.branches[depth][1], []).append(finding)
-    likely = [name for name, own in members.items() if any(len(f.path) > len(path) for f in own)]
-    if not likely:  # the value has no member's shape: say all that it could be
-        return []
-    types = ("literal_error", ("type",)), ("literal_error", ("kind",))
-    named = [name for name in likely if not any((f.kind, f.path[-1:]) in types for f in members[name])] or likely
-    meant = min(named, key=lambda name: len(members[name]))
-    return [f for name, own in members.items() if name != meant for f in own]
+        if not any(union == finding.path and union in entered for union in finding.unions):
+            places.setdefault(finding.path, []).append(finding)
+    return [merged for same in places.values() for merged in _merged(same)]
 
 
 def _merged(same: Sequence[_Finding]) -> Iterable[_Finding]:

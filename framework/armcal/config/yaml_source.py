@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -426,11 +427,7 @@ def find_key(value: Any, step: Step) -> Step | None:
         return None
     if step in value:
         return step
-    for key in value:
-        split = split_suffix(key)
-        if split is not None and split[0] == step:
-            return str(key)
-    return None
+    return next((str(key) for key in value if (split := split_suffix(key)) is not None and split[0] == step), None)
 
 
 def load_config(
@@ -525,13 +522,8 @@ class Reader:
             kind = "a list" if isinstance(own.value, tuple) else f"the value {str(own.value)[:60]!r}"
             hint = "Write 'key: value' lines; put a space after each colon."
             origin.refuse(f"found {kind} at the top, expected keys and values.", hint, own.line)
-        merged: Node | None = None
-        for parent in parents_of(own):
-            base = self.parent(parent, (*chain, resolved))
-            merged = base if merged is None else merge(merged, base)
-        entries = {key: node for key, node in entries_of(own).items() if key != "extends"}
-        own = replace(own, value=entries)
-        self.done[resolved] = own if merged is None else merge(merged, own)
+        bases = [self.parent(parent, (*chain, resolved)) for parent in parents_of(own)]
+        self.done[resolved] = reduce(merge, [*bases, _without(own, "extends")])
         return self.done[resolved]
 
     def parent(self, text: ConfigText, chain: tuple[Path, ...]) -> Node:
@@ -569,19 +561,14 @@ def _scalar(node: Node, path: tuple[Step, ...]) -> Any:
 
 
 VARIANTS = ("study", "variants")  # Where a study lists its variants; the section is no part of any
-_KEYS = ("extends", "set", "add")
 
 
-@dataclass(frozen=True)
-class Variants:
-    """A configuration with its variants' section, and every variant without it, in the order written."""
+def load_variants(
+    path: str | Path, overrides: Sequence[str] = (), listed: tuple[str, str] = VARIANTS
+) -> tuple[ConfigSource, dict[str, ConfigSource]]:
+    """A YAML config, and by name in the order written the variants that it lists, without their section.
 
-    base: ConfigSource
-    variants: dict[str, ConfigSource]
-
-
-def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple[str, str] = VARIANTS) -> Variants:
-    """Read the variants that a YAML config lists; without any, the config itself is the only one, called as the file.
+    Without any, the config itself is the only one, called as the file.
 
     A variant is the rest of the config, then what it ``extends`` (an earlier variant by its name, files), then the
     overrides, then the values that it sets (``set: {a.b: value}``) and the entries that it adds to lists
@@ -593,21 +580,19 @@ def load_variants(path: str | Path, overrides: Sequence[str] = (), listed: tuple
     for text in overrides:
         tree = override(tree, text)
     outside = [text for text in overrides if text.strip().partition("=")[0].partition(".")[0].strip() != listed[0]]
-    section = entries_of(tree).get(listed[0])
-    variants = entries_of(section).get(listed[1]) if section else None
+    alone, variants = _without(tree, listed[0]), _at(tree, listed)
     made: dict[str, Node] = {}
     for name, node in entries_of(variants).items() if variants else ():
-        made[str(name)] = _variant((*listed, str(name)), node, _without(tree, listed[0]), made, reader, outside)
-    made = made or {path.stem: _without(tree, listed[0])}
-    sources = {name: as_source(made[name], path, reader) for name in made}
-    return Variants(as_source(tree, path, reader), sources)
+        made[str(name)] = _variant((*listed, str(name)), node, alone, made, reader, outside)
+    made = made or {path.stem: alone}
+    return as_source(tree, path, reader), {name: as_source(node, path, reader) for name, node in made.items()}
 
 
 def _variant(
     at: tuple[str, str, str], node: Node, base: Node, earlier: dict[str, Node], reader: Reader, overrides: Sequence[str]
 ) -> Node:
     entries = entries_of(node)
-    unknown = sorted(set(entries) - set(_KEYS))
+    unknown = sorted(entries.keys() - {"extends", "set", "add"})
     if unknown or not (isinstance(node.value, dict) or node.value is None):
         message = f"found {', '.join(unknown) or str(node.value)[:60]!r} in a variant, expected extends, set or add."
         hint = f"Write for example {at[2]}: {{extends: FILE, set: {{parameters.bounds: none}}}}."
@@ -627,42 +612,39 @@ def _variant(
             value.origin.refuse(message, hint, value.line, (*at, "set"))
         tree = set_at(tree, steps, replace(value, origin=replace(value.origin, prefix=steps)))
     for steps, value in _by_path(entries.get("add"), (*at, "add")):
-        there = _at(tree, steps)
         more = value.value if isinstance(value.value, tuple) else (value,)
-        if there is not None and there.value is not None and not isinstance(there.value, tuple):
-            message = f"found {str(there.value)[:60]!r} at {'.'.join(steps)}, expected a list to add to."
+        there = _at(tree, steps)
+        kept = () if there is None or there.value is None else there.value
+        if not isinstance(kept, tuple):
+            message = f"found {str(kept)[:60]!r} at {'.'.join(steps)}, expected a list to add to."
             value.origin.refuse(message, "Use set: to replace it.", value.line)
-        kept = there.value if there is not None and isinstance(there.value, tuple) else ()
         own = replace(value, value=(*kept, *more), origin=replace(value.origin, prefix=steps))
         tree = set_at(tree, steps, own)
     return tree
 
 
-def _without(tree: Node, section: str) -> Node:
-    return replace(tree, value={key: node for key, node in entries_of(tree).items() if key != section})
+def _without(tree: Node, left_out: str) -> Node:
+    return replace(tree, value={key: node for key, node in entries_of(tree).items() if key != left_out})
 
 
-def _by_path(node: Node | None, at: tuple[str, ...]) -> list[tuple[tuple[str, ...], Node]]:
+def _by_path(node: Node | None, at: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Node]]:
     if node is None or node.value is None:
-        return []
-    variants = []
+        return
     for name, value in entries_of(node).items():
         steps = steps_of(str(name))
         if steps is None or steps[0] in ("extends", at[0]):
             hint = "Write for example parameters.bounds: none."
             value.origin.refuse(f"found {name!r}, expected the dotted name of a value.", hint, value.line, at)
-        variants.append((steps, value))
+        yield steps, value
     if not isinstance(node.value, dict):
         node.origin.refuse("expected dotted names with values.", "Write NAME: value lines below it.", node.line, at)
-    return variants
 
 
 def _at(tree: Node, steps: tuple[str, ...]) -> Node | None:
     """The node at a path; list entries count from 0."""
     there: Node | None = tree
     for step in steps:
-        if there is not None and isinstance(there.value, tuple):
-            there = dict(zip(map(str, range(len(there.value))), there.value, strict=True)).get(step)
-        else:
-            there = entries_of(there).get(step) if there else None
+        value = there.value if there else None
+        entries = {str(i): node for i, node in enumerate(value)} if isinstance(value, tuple) else value
+        there = entries.get(step) if isinstance(entries, dict) else None
     return there

@@ -1,10 +1,12 @@
-"""Lines of text as they come, by standard input or in datagrams.
+"""Lines of text as they come, by standard input or in datagrams to a UDP port of this machine.
 
+Datagrams of other machines come by socat or SSH.
 A source never waits. Its ``lines`` are all that are complete since the last call, without their ends; None stands for
 one that was too long. ``ended`` says whether nothing more will come, and ``close`` may be called twice.
 """
 
 import os
+import re
 import select
 import socket
 import sys
@@ -14,10 +16,11 @@ from typing import Annotated
 from pydantic import BeforeValidator
 
 from armcal.devices.device import DeviceRefusedError
-from armcal.errors import InputError
-from armcal.io.lines import LOOPBACK, LineCutter, bound, port_of
+from armcal.errors import Location
+from armcal.io.lines import LineCutter
 
 STANDARD_INPUT = "-"
+LOOPBACK = "127.0.0.1"
 KINDS = "- (standard input) or udp:PORT of this machine"
 
 LONGEST_LINE_BYTES = 64 * 1024
@@ -26,8 +29,13 @@ _MOST_AT_ONCE = 16  # chunks, or thousands of datagrams, that are taken at once;
 _BUFFER_BYTES = 4 << 20
 
 
+def _port_of(text: str) -> int | None:
+    match = re.fullmatch("udp:([0-9]{1,5})", text)
+    return None if match is None or int(match[1]) > 65535 else int(match[1])
+
+
 def _named(value: object) -> object:
-    if isinstance(value, str) and value != STANDARD_INPUT and port_of(value) is None:
+    if isinstance(value, str) and value != STANDARD_INPUT and _port_of(value) is None:
         raise ValueError(f"found {str(value)!r}, expected {KINDS}: tail -F FILE gives the lines of a file that grows")
     return value
 
@@ -36,7 +44,7 @@ SourceName = Annotated[str, BeforeValidator(_named)]  # ``-`` or ``udp:PORT``
 
 
 def open_lines(name: str) -> "LineSource":
-    port = port_of(name)
+    port = _port_of(name)
     return InputLines() if port is None else UdpLines(LOOPBACK, port)
 
 
@@ -80,9 +88,9 @@ class UdpLines:
     def __init__(self, host: str, port: int) -> None:
         try:
             self._socket = bound(host, port)
-        except InputError as fault:
-            raise DeviceRefusedError(fault.message, where=fault.where, hint=fault.hint) from fault
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        except OSError as fault:
+            where, hint = Location(f"udp:{host}:{port}"), "Give a free port, and an address of this machine."
+            raise DeviceRefusedError(f"the socket cannot be opened ({fault}).", where=where, hint=hint) from fault
         self.ended = False
 
     @property
@@ -105,3 +113,16 @@ class UdpLines:
 
 
 LineSource = InputLines | UdpLines
+
+
+def bound(host: str, port: int) -> socket.socket:
+    """A UDP socket that never waits and holds some seconds of datagrams; OSError where there can be none."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        opened.bind((host, port))
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        opened.setblocking(False)
+    except OSError:
+        opened.close()
+        raise
+    return opened

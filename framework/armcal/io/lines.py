@@ -1,20 +1,12 @@
-"""Lines: cut from bytes as they come, by UDP too, and written to standard output, which may be closed or not read.
-
-A UDP port is of this machine; datagrams of others come by socat or SSH.
-"""
+"""Lines: cut from bytes as they come, and written to standard output, which may be closed or not read."""
 
 import contextlib
 import io
 import os
-import re
 import select
-import socket
 from typing import BinaryIO
 
-from armcal.errors import InputError, Location
-
 MAX_LINE_BYTES = 1024**2
-LOOPBACK = "127.0.0.1"
 _AT_ONCE = 4096  # A pipe that is ready takes so many bytes without waiting (PIPE_BUF)
 
 
@@ -91,21 +83,3 @@ class StandardOutput:
                 self._begun = bool(data)
         except (OSError, ValueError):
             self.closed = True
-
-
-def port_of(text: str) -> int | None:
-    """The port of ``udp:PORT``, which this machine alone reaches; None if it is none."""
-    match = re.fullmatch("udp:([0-9]{1,5})", text)
-    return None if match is None or int(match[1]) > 65535 else int(match[1])
-
-
-def bound(host: str, port: int) -> socket.socket:
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        opened.bind((host, port))
-    except OSError as fault:
-        opened.close()
-        where, hint = Location(f"udp:{host}:{port}"), "Give a free port, and an address of this machine."
-        raise InputError(f"the socket cannot be opened ({fault}).", where=where, hint=hint) from fault
-    opened.setblocking(False)
-    return opened

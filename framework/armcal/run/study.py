@@ -199,8 +199,7 @@ class Study:
         registry: PluginRegistry | None = None,
     ) -> Self:
         registry = registry or discover()
-        read = load_variants(path, overrides)
-        source = read.base
+        source, variants = load_variants(path, overrides)
         if not isinstance(source.data.get("study"), dict):
             raise ConfigError(
                 "found no study.",
@@ -208,14 +207,13 @@ class Study:
                 hint="Give study: {variants: {NAME: {extends: FILE}, ...}}; see docs/study.md.",
             )
         settings = validate(StudySettings, source, ("study",))
-        if settings.reference not in (PREVIOUS, *read.variants):
+        if settings.reference not in (PREVIOUS, *variants):
             raise ConfigError(
-                f"found the reference {settings.reference!r}, expected {PREVIOUS} or one of "
-                f"{', '.join(read.variants)}.",
+                f"found the reference {settings.reference!r}, expected {PREVIOUS} or one of {', '.join(variants)}.",
                 where=source.where(("study", "reference")),
             )
         experiments = {}
-        for name, variant in read.variants.items():
+        for name, variant in variants.items():
             experiment = _naming(name, partial(Experiment.of, variant, data, registry))
             # Without the split that a run would make, a study draws its own folds; nothing is compiled before
             # everything is known to be solvable.
