@@ -71,7 +71,6 @@ class RegisterMap:
     bauds: tuple[int, ...]  # rates that they can be set to, the likeliest first
 
     def numbers(self, stretch: Stretch, data: bytes) -> dict[str, int]:
-        """What a stretch of registers holds, by name."""
         first, count = stretch
         there = {name: r for name, r in self.registers.items() if first <= r.address <= first + count - r.size}
         return {name: r.unpack(data[r.address - first : r.address - first + r.size]) for name, r in there.items()}
@@ -402,7 +401,6 @@ class Bus:
         self.write(servo, register.address, register.pack(value))
 
     def numbers(self, servos: Iterable[int], *stretches: Stretch) -> dict[int, dict[str, int]]:
-        """What stretches of registers hold, by id and name."""
         numbers: dict[int, dict[str, int]] = {servo: {} for servo in servos}
         for stretch in stretches:
             for servo, data in self.read_all(numbers, *stretch).items():

@@ -175,7 +175,7 @@ class Servos(MeasuringDevice):
     def __init__(self, settings: ServoJointsSettings, names: Iterable[str]) -> None:
         self.joints = settings.chosen(names)
         self.bus = Bus(settings, {joint.id: name for name, joint in self.joints.items()})
-        self.stored: dict[str, dict[str, int]] = {}  # what those that ``examine`` recognised keep without power
+        self.stored: dict[str, dict[str, int]] = {}  # in those that ``examine`` recognised; empty: not open
 
     def open(self, clock: Clock) -> DeviceIdentity:
         """Open the bus; what is not as configured is refused, with every fault."""
@@ -198,6 +198,7 @@ class Servos(MeasuringDevice):
         return DeviceIdentity(f"{len(self.joints)} servos ({models}) on {on}", identity_of(parts), None, adapter)
 
     def close(self) -> None:
+        self.stored = {}
         self.bus.close()
 
     def examine(self) -> list[Mistake]:
@@ -424,6 +425,8 @@ class ServoBusDevice(Servos, JointDevice):
 
     def _write_goals(self, goals: Mapping[str, int]) -> None:
         """All at once: nobody acknowledges that, and ``keep_alive`` repeats what did not arrive."""
+        if not self.stored:  # what nobody sends now must not be sent once it is open again
+            raise DeviceLostError("the device is not open.", where=self.bus.where, hint="Open it.")
         self._goals |= goals
         written = {self.joints[joint].id: self._goal_bytes(joint) for joint in goals}
         self.bus.write_all(self.bus.map.registers["goal"].address, written)
