@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -71,7 +71,6 @@ class RegisterMap:
     bauds: tuple[int, ...]  # rates that they can be set to, the likeliest first
 
     def numbers(self, stretch: Stretch, data: bytes) -> dict[str, int]:
-        """What a stretch of registers holds, by name."""
         first, count = stretch
         there = {name: r for name, r in self.registers.items() if first <= r.address <= first + count - r.size}
         return {name: r.unpack(data[r.address - first : r.address - first + r.size]) for name, r in there.items()}
@@ -98,10 +97,8 @@ class ServoModel(NamedTuple):
         if self.teeth:
             tooth = COUNTS / self.teeth
             amount = "it by " + teeth_text(math.ceil(beyond / tooth), math.degrees(tooth * STEP))
-        raise ValueError(
-            f"found an offset of {offset} counts, expected -{limit} to {limit}, which is all that a {self.name} holds: "
-            f"remount {amount}"
-        )
+        range_text = f"expected -{limit} to {limit}, which is all that a {self.name} holds"
+        raise ValueError(f"found an offset of {offset} counts, {range_text}: remount {amount}")
 
 
 def _registers(protocol: ProtocolName) -> dict[str, Register]:
@@ -181,6 +178,9 @@ class Status(NamedTuple):
     alarm: int  # the bits by which it says that it is unwell; of protocol 2 only that it is
     refusal: str  # why it did not do what it was asked, in words; empty if it did
     data: bytes  # what was read
+
+    def fits(self, count: int | None) -> bool:
+        return bool(self.refusal) or count is None or len(self.data) == count
 
 
 class Received(NamedTuple):
@@ -282,6 +282,22 @@ FRAMINGS: Mapping[ProtocolName, Framing] = {
 }
 
 
+@dataclass(frozen=True)
+class FoundServo:
+    """A servo that answers, as it was read without writing anything to it."""
+
+    id: int
+    model_number: int
+    model: str | None  # its name; None: the number is not known
+    firmware: str = ""
+    position: int | None = None  # as it reports it (counts)
+    voltage_V: float | None = None
+    temperature_C: int | None = None
+    alarms: tuple[str, ...] = ()  # in words
+    damaged: int = 0  # so many of its answers were damaged, or followed by another one
+    doubled: bool = False  # so many that two servos have its id
+
+
 class BusSettings(SerialPortSettings):
     """The port, its baud rate, the protocol, and for how long an answer is waited for.
 
@@ -345,12 +361,10 @@ class Bus:
             self._ask(servo, Instruction.WRITE, self._framing.numbers(address) + data, 0)
         except DeviceLostError:
             if (read_back := self.read(servo, address, len(data))) != data:
-                raise DeviceError(
-                    f"{self.name(servo)} holds {read_back.hex(' ')} at register {address} after {data.hex(' ')} was "
-                    "written.",
-                    where=self.where,
-                    hint="Look at its plug and its power; a register may be locked while torque is on.",
-                ) from None
+                after, wrote = read_back.hex(" "), data.hex(" ")
+                text = f"{self.name(servo)} holds {after} at register {address} after {wrote} was written."
+                hint = "Look at its plug and its power; a register may be locked while torque is on."
+                raise DeviceError(text, where=self.where, hint=hint) from None
 
     def read_all(self, servos: Iterable[int], address: int, count: int) -> dict[int, bytes]:
         """Registers of several servos, by id: in one exchange, and those whose answer was lost one by one."""
@@ -387,7 +401,6 @@ class Bus:
         self.write(servo, register.address, register.pack(value))
 
     def numbers(self, servos: Iterable[int], *stretches: Stretch) -> dict[int, dict[str, int]]:
-        """What stretches of registers hold, by id and name."""
         numbers: dict[int, dict[str, int]] = {servo: {} for servo in servos}
         for stretch in stretches:
             for servo, data in self.read_all(numbers, *stretch).items():
@@ -404,22 +417,63 @@ class Bus:
     def name(self, servo: int) -> str:
         return f"{self._names[servo]} (id {servo})" if servo in self._names else f"the servo with id {servo}"
 
+    def present(self, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
+        """Ids that answer, or from which something comes.
+
+        Feetech servos that are asked all at once may talk all at once: what they say then is only a hint. Where any
+        answers, those that are silent are asked once more: a packet is lost now and then.
+        """
+        hints = {answer.id for answer in self.probe(_BROADCAST, _BROADCAST_S).answers}
+        silent, there = sorted({*ids, *hints}), list[int]()
+        for _ in range(2):
+            for servo in silent:
+                heard = self.probe(servo, _ONE_S)
+                if heard.damaged and not heard.answers:  # noise is not there again
+                    heard = self.probe(servo, _ONE_S)
+                if heard.damaged or servo in {answer.id for answer in heard.answers}:
+                    there.append(servo)
+            silent = [servo for servo in silent if servo not in there]
+            if not there:
+                break
+        return sorted(there)
+
+    def looked_at(self, servo: int, times: int = _AGAIN) -> FoundServo | None:
+        """What a servo says of itself; None: nothing. Read several times: two with one id do not answer alike."""
+        before = self.counts["damaged"] + self.counts["extra"]
+        names, numbers = ("model", "firmware", "position", "voltage", "temperature"), dict[str, int]()
+        for _ in range(times):
+            with suppress(DeviceError):
+                numbers = {name: self.number(servo, name) for name in names}
+        damaged = self.counts["damaged"] + self.counts["extra"] - before
+        answering = FoundServo(servo, 0, None, damaged=damaged, doubled=damaged >= _AGAIN)
+        if not numbers:
+            return answering if damaged else None
+        model, firmware, protocol = numbers["model"], numbers["firmware"], self.settings.protocol
+        return replace(
+            answering,
+            model_number=model,
+            model=next((m.name for m in MODELS.values() if (m.protocol, m.number) == (protocol, model)), None),
+            firmware=f"{firmware & 0xFF}.{firmware >> 8}" if protocol == "feetech" else str(firmware),
+            position=numbers["position"],
+            voltage_V=round(numbers["voltage"] * self.map.registers["voltage"].unit, 3),
+            temperature_C=numbers["temperature"],
+            alarms=self.alarms(servo),
+        )
+
     def _ask(self, servo: int, instruction: Instruction, parameters: bytes, count: int) -> Status:
         packet = self._framing.encoded(servo, instruction, parameters)
         was_damaged = 0
         for attempt in range(self.settings.tries):
             wait = self._wait(len(packet) + count + self._framing.overhead, attempt)
             received = self._exchange(packet, frozenset((servo,)), count, wait)
-            answer = next((one for one in received.answers if one.id == servo and _fits(one, count)), None)
+            answer = next((one for one in received.answers if one.id == servo and one.fits(count)), None)
             was_damaged += received.damaged > 0
             if answer is None or answer.refusal == _DAMAGED:
                 continue
             if answer.refusal:
-                raise DeviceError(
-                    f"{self.name(servo)} refuses to {instruction.name.lower()}: {answer.refusal}.",
-                    where=self.where,
-                    hint="Check that its model is the configured one; some registers are locked while torque is on.",
-                )
+                text = f"{self.name(servo)} refuses to {instruction.name.lower()}: {answer.refusal}."
+                hint = "Check that its model is the configured one; some registers are locked while torque is on."
+                raise DeviceError(text, where=self.where, hint=hint)
             return answer
         name, tries = self.name(servo), self.settings.tries
         if was_damaged:
@@ -465,76 +519,10 @@ class Bus:
             noise += 0 if received.answers or received.damaged else len(rest) - len(received.rest)
             answers += received.answers
             damaged, rest = damaged + received.damaged, received.rest
-            missing -= {answer.id for answer in received.answers if _fits(answer, count)}
+            missing -= {answer.id for answer in received.answers if answer.fits(count)}
         damaged += bool(missing and (rest or noise >= _NOISE))
         self._is_clean = not missing and not rest
         self._alarms |= {answer.id: answer.alarm for answer in answers}
         self.counts["damaged"] += damaged
         self.counts["extra"] += not missing and (bool(rest) or len(answers) > len(servos))
         return Received(tuple(answers), damaged)
-
-
-def _fits(answer: Status, count: int | None) -> bool:
-    return bool(answer.refusal) or count is None or len(answer.data) == count
-
-
-@dataclass(frozen=True)
-class FoundServo:
-    """A servo that answers, as it was read without writing anything to it."""
-
-    id: int
-    model_number: int
-    model: str | None  # its name; None: the number is not known
-    firmware: str = ""
-    position: int | None = None  # as it reports it (counts)
-    voltage_V: float | None = None
-    temperature_C: int | None = None
-    alarms: tuple[str, ...] = ()  # in words
-    damaged: int = 0  # so many of its answers were damaged, or followed by another one
-    doubled: bool = False  # so many that two servos have its id
-
-
-def present(bus: Bus, ids: Iterable[int] = _FIRST_IDS) -> list[int]:
-    """Ids that answer, or from which something comes.
-
-    Feetech servos that are asked all at once may talk all at once: what they say then is only a hint. Where any
-    answers, those that are silent are asked once more: a packet is lost now and then.
-    """
-    hints = {answer.id for answer in bus.probe(_BROADCAST, _BROADCAST_S).answers}
-    silent, there = sorted({*ids, *hints}), list[int]()
-    for _ in range(2):
-        for servo in silent:
-            heard = bus.probe(servo, _ONE_S)
-            if heard.damaged and not heard.answers:  # noise is not there again
-                heard = bus.probe(servo, _ONE_S)
-            if heard.damaged or servo in {answer.id for answer in heard.answers}:
-                there.append(servo)
-        silent = [servo for servo in silent if servo not in there]
-        if not there:
-            break
-    return sorted(there)
-
-
-def looked_at(bus: Bus, servo: int, times: int = _AGAIN) -> FoundServo | None:
-    """What a servo says of itself; None: nothing. It is read several times, for two with one id do not answer alike."""
-    before = bus.counts["damaged"] + bus.counts["extra"]
-    names, numbers = ("model", "firmware", "position", "voltage", "temperature"), dict[str, int]()
-    for _ in range(times):
-        with suppress(DeviceError):
-            numbers = {name: bus.number(servo, name) for name in names}
-    damaged = bus.counts["damaged"] + bus.counts["extra"] - before
-    if not numbers:
-        return FoundServo(servo, 0, None, damaged=damaged, doubled=damaged >= _AGAIN) if damaged else None
-    firmware, protocol = numbers["firmware"], bus.settings.protocol
-    return FoundServo(
-        servo,
-        numbers["model"],
-        next((m.name for m in MODELS.values() if (m.protocol, m.number) == (protocol, numbers["model"])), None),
-        f"{firmware & 0xFF}.{firmware >> 8}" if protocol == "feetech" else str(firmware),
-        position=numbers["position"],
-        voltage_V=round(numbers["voltage"] * bus.map.registers["voltage"].unit, 3),
-        temperature_C=numbers["temperature"],
-        alarms=bus.alarms(servo),
-        damaged=damaged,
-        doubled=damaged >= _AGAIN,
-    )

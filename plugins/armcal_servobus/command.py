@@ -3,26 +3,31 @@
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, get_args
 
 import click
 from armcal.cli.common import FILE, Console, overrides, speaking
 from armcal.config.validate import validate
 from armcal.config.yaml_source import load_config
 from armcal.devices.device import DeviceError, DeviceRefusedError
-from armcal.devices.wiring import WiringRecord
+from armcal.devices.wiring import WiringRecord, bench_section
 from armcal.errors import EXIT_BAD_INPUT, ConfigError, InputError, Location
 
-from armcal_servobus.bus import COUNTS, LAST_ID, MAPS, STEP, Bus, BusSettings, ProtocolName, looked_at, present
-from armcal_servobus.device import ServoBusSettings, ServoStreamSettings
-from armcal_servobus.joints import SEVERAL_TURNS, ServoJoint, ServoJointsSettings, Servos
+from armcal_servobus.bus import COUNTS, LAST_ID, MAPS, STEP, Bus, BusSettings, ProtocolName
+from armcal_servobus.device import (
+    SEVERAL_TURNS,
+    ServoBusSettings,
+    ServoJoint,
+    ServoJointsSettings,
+    Servos,
+    ServoStreamSettings,
+)
 
 _KINDS: Mapping[str, type[ServoJointsSettings]] = {"device": ServoBusSettings, "joints": ServoStreamSettings}
-Number = TypeVar("Number", int, float)
 _EEPROM_S = 0.02
 _SAME_COUNTS = 4
 
@@ -55,7 +60,7 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
             wires = Bus(BusSettings.model_validate({"port": port, "protocol": spoken, "baud": rate}))
             try:
                 wires.open()
-                servos = [looked_at(wires, servo) for servo in present(wires, range(last_id + 1))]
+                servos = [wires.looked_at(servo) for servo in wires.present(range(last_id + 1))]
             except DeviceRefusedError as refusal:
                 if isinstance(refusal.__cause__, ValueError):  # a baud rate that the port lacks
                     continue
@@ -70,16 +75,22 @@ def find(console: Console, port: str, protocol: ProtocolName | None, baud: tuple
         raise InputError(text, where=Location(port), hint=hint)
     spoken, results = max(there.items(), key=lambda item: any(row["model"] for row in item[1]))
     console.result({"port": port, "protocol": spoken, "servos": results})
-    rows = []
-    for row in results:
-        state = "two servos with this id?" if row["doubled"] else ", ".join(row["alarms"]) or "well"
-        shown = {**row, "model": row["model"] or f"model {row['model_number']}"}
-        keys = ("baud", "id", "model", "firmware", "position", "voltage_V", "temperature_C")
-        rows.append([*("" if shown[key] is None else shown[key] for key in keys), state])
-    headings = ("baud", "id", "model", "firmware", "count", "V", "deg C", "state")
-    console.table(f"{port}, {spoken}", headings, rows, left=("state",))
+    keys = ("baud", "id", "model", "firmware", "position", "voltage_V", "temperature_C")
+    shown = ({**row, "model": row["model"] or f"model {row['model_number']}"} for row in results)
+    _table(console, f"{port}, {spoken}", keys, shown)
     for number in sorted({row["id"] for row in results if row["doubled"]}):
         console.warn(f"two servos may have the id {number}: unplug all but one, and give it another id.")
+
+
+def _table(console: Console, title: str, keys: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """What servos said, and how they are."""
+    headings = {"angle_deg": "deg", "position": "count", "voltage_V": "V", "temperature_C": "deg C"}
+    shown = []
+    for row in rows:
+        state = ", ".join(row["alarms"]) or ("holds" if row.get("torque") else "well")
+        state = "two servos with this id?" if row.get("doubled") else state
+        shown.append([*("" if row[key] is None else row[key] for key in keys), state])
+    console.table(title, [*(headings.get(key, key) for key in keys), "state"], shown, left=("state",))
 
 
 def _on_config(command: Any) -> Any:
@@ -90,9 +101,7 @@ def _on_config(command: Any) -> Any:
 def _opened(config: Path, overrides: tuple[str, ...]) -> Iterator[tuple[Servos, WiringRecord]]:
     """The servos of the bench's device, or of its joint stream, and the record of which were checked."""
     source = load_config(config, overrides)
-    bench = source.data.get("bench")
-    parts = bench if isinstance(bench, dict) else {}
-    there = (p for p in _KINDS if isinstance(parts.get(p), dict) and parts[p].get("type") == "servobus")
+    there = (part for part in _KINDS if bench_section(source, part).get("type") == "servobus")
     if (part := next(there, None)) is None:
         hint = "Give bench: {device: {type: servobus, port: ..., joints: ...}}; docs/servo_bus.md has an example."
         raise ConfigError("found no servo bus.", where=source.where(("bench",)), hint=hint)
@@ -119,7 +128,7 @@ def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
             {
                 "joint": name,
                 "id": joints[name].id,
-                "angle_deg": round(math.degrees(servos.angle(name, reading)), 2),
+                "angle_deg": round(math.degrees(joints[name].measured(reading["position"])), 2),
                 "count": reading["position"],
                 "offset": stored[name]["offset"],
                 "limits": [stored[name]["min"], stored[name]["max"]],
@@ -133,15 +142,10 @@ def check(console: Console, config: Path, overrides: tuple[str, ...]) -> None:
     across = [name for name, joint in joints.items() if joint.crosses_seam]
     named = [{"joint": mistake.joint, "what": mistake.what, "mend": mistake.mend} for mistake in mistakes]
     console.result({"joints": rows, "mistakes": named, "ranges_over_the_seam": across})
-    measured = ("joint", "id", "angle_deg", "count", "offset", "voltage_V", "temperature_C")
-    states = (", ".join(row["alarms"]) or ("holds" if row["torque"] else "well") for row in rows)
-    shown = ([*(row[key] for key in measured), state] for row, state in zip(rows, states, strict=True))
-    headings = ("joint", "id", "deg", "count", "offset", "V", "deg C", "state")
-    console.table(str(config), headings, shown, left=("state",))
+    _table(console, str(config), ("joint", "id", "angle_deg", "count", "offset", "voltage_V", "temperature_C"), rows)
     for name in across:
-        console.warn(
-            f"the range of {name} crosses the end of its encoder's turn: it can be read there, and not driven."
-        )
+        what = "crosses the end of its encoder's turn: it can be read there, and not driven"
+        console.warn(f"the range of {name} {what}.")
     for mistake in mistakes:
         console.warn(f"{mistake.joint} {mistake.what}. {mistake.mend}")
     if mistakes:
@@ -202,11 +206,9 @@ def write_offset(bus: Bus, plan: Homing) -> None:
         time.sleep(_EEPROM_S)
     after, position = bus.number(servo, "offset"), bus.number(servo, "position")
     if after != plan.after or abs(_nearest(position - target)) > _SAME_COUNTS:
-        raise DeviceError(
-            f"{bus.name(servo)} holds the offset {after} and reports {position}, expected {plan.after} and {target}.",
-            where=bus.where,
-            hint="Was the arm moved meanwhile? Hold it still, and do it again.",
-        )
+        what, expected = f"holds the offset {after} and reports {position}", f"{plan.after} and {target}"
+        hint = "Was the arm moved meanwhile? Hold it still, and do it again."
+        raise DeviceError(f"{bus.name(servo)} {what}, expected {expected}.", where=bus.where, hint=hint)
 
 
 def _nearest(counts: int) -> int:
@@ -222,17 +224,7 @@ def _nearest(counts: int) -> int:
 @click.option("--release", is_flag=True, help="Let servos go that hold; hold the arm.")
 @click.option("--yes", is_flag=True, help="Write without asking.")
 @_on_config
-def home(
-    console: Console,
-    config: Path,
-    angles: tuple[str, ...],
-    offsets: tuple[str, ...],
-    calibration: Path | None,
-    arm_name: str | None,
-    release: bool,
-    yes: bool,
-    overrides: tuple[str, ...],
-) -> None:
+def home(console: Console, config: Path, overrides: tuple[str, ...], calibration: Path | None, **given: Any) -> None:
     """Set homing offsets, after a question.
 
     Afterwards the servos report the angles at which you hold the arm, or those that a calibration found: of the joints
@@ -241,10 +233,11 @@ def home(
     from armcal.calibration.calibration import zeros_of
 
     with _opened(config, overrides) as (servos, checks):
-        degrees, counts = _numbers(angles, float, "--at q2=90"), _numbers(offsets, int, "--offset q2=-137")
+        degrees = _numbers(given["angles"], float, "--at q2=90")
+        counts = _numbers(given["offsets"], int, "--offset q2=-137")
         zeros: dict[str, float] = {}  # rad
         if calibration is not None:
-            computed, reasons = zeros_of(calibration, arm_name, console.registry())
+            computed, reasons = zeros_of(calibration, given["arm_name"], console.registry())
             for name, reason in reasons.items():
                 console.warn(f"{name} keeps its zero: {reason}.")
             by_local = {name: name.rpartition(".")[2] for name in servos.joints}
@@ -255,17 +248,16 @@ def home(
                 raise InputError(f"found no joint {name}, expected one of {listed}.", hint="Correct its name.")
         chosen = {*degrees, *counts} or set(zeros) or set(servos.joints)
         servos.joints = {name: joint for name, joint in servos.joints.items() if name in chosen}
-        for name in reversed(servos.joints) if release else ():
+        for name in reversed(servos.joints) if given["release"] else ():
             servos.release(name)
         plans = planned(servos, {name: math.radians(angle) for name, angle in degrees.items()}, zeros, counts)
         rows = ((p.joint.name, p.joint.id, p.position, p.before, p.after, f"{p.change_deg:+.2f}") for p in plans)
         console.table(str(config), ("joint", "id", "count", "offset", "new offset", "change deg"), rows)
         back = " ".join(f"--offset {plan.joint.name}={plan.before}" for plan in plans)
-        # kept nowhere else: said in any case
-        click.echo(f"To take them back: armcal bus home {config} {back}", err=True)
-        if not yes and not sys.stdin.isatty():
+        click.echo(f"To take them back: armcal bus home {config} {back}", err=True)  # kept nowhere else
+        if not given["yes"] and not sys.stdin.isatty():
             raise InputError("nothing was written: there is no terminal to ask at.", hint="Give --yes.")
-        if not yes and not click.confirm("Write these offsets to the servos?", err=True):
+        if not given["yes"] and not click.confirm("Write these offsets to the servos?", err=True):
             raise InputError("nothing was written.", hint="Say yes, or give --yes.")
         checks.forget(servos.joints)
         for plan in plans:
@@ -277,7 +269,7 @@ def home(
         console.line("Now the zeros of the configuration are those of before: set them to 0, and measure anew.")
 
 
-def _numbers(stated: Sequence[str], number: Callable[[str], Number], example: str) -> dict[str, Number]:
+def _numbers(stated: Sequence[str], number: Callable[[str], Any], example: str) -> dict[str, Any]:
     """Numbers by joint, from ``JOINT=NUMBER``."""
     numbers = {}
     for text in stated:

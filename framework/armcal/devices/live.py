@@ -1,14 +1,20 @@
 """What a bench is measured with, live: joint readings of arms guided by hand, trackers, cameras."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import isfinite, isnan
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
 from armcal.base.arrays import Array
-from armcal.devices.clock import Clock
+from armcal.base.settings import Settings
+from armcal.devices.clock import Clock, RealClock
+from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError, DeviceState, MeasuringDevice
+from armcal.errors import ConfigError
 from armcal.measure.measurement import Measurement
 from armcal.plugins import expecting, refuse
 
@@ -47,6 +53,108 @@ class JointStream(Protocol):
 
     def close(self) -> None:
         """Stop. May be called twice."""
+
+
+_AGAIN_S = 0.5
+
+
+class GuidedSettings(Settings):
+    """How often the joints are read.
+
+    ``torque`` is what becomes of servos that hold: they are a reason to refuse, or are let go one by one, so that a
+    loaded arm drops.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0, le=500)] = 50.0
+    torque: Literal["refuse", "release"] = "refuse"
+
+
+class GuidedDevice(MeasuringDevice, Protocol):
+    """What ``GuidedJoints`` needs of a device; its methods are those of ``JointDevice``."""
+
+    def open(self, clock: Clock) -> object: ...
+
+    def state(self) -> DeviceState: ...
+
+    def release(self, joint: str) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class GuidedJoints(JointStream):
+    """The joint stream of a device that knows where its joints stand; a base class for plugins of such devices.
+
+    The arm is guided by hand: servos that hold are refused or let go, and all joints are read at a rate. What does not
+    answer is counted, and asked again half a second later.
+    """
+
+    def __init__(self, settings: GuidedSettings, device_of: Callable[[tuple[str, ...]], GuidedDevice]) -> None:
+        """``device_of`` makes the device whose joints are some channels; it raises ValueError if there is none."""
+        self._settings, self._device_of = settings, device_of
+        self._refused: Counter[str] = Counter()
+        self._clock: Clock = RealClock()
+        self._next = 0.0
+        self._device: GuidedDevice | None = None
+
+    def reopen(self, device: GuidedDevice) -> None:
+        """After a reading that failed; a device whose ``open`` takes long is opened by a quicker way here."""
+        device.open(self._clock)
+
+    @override
+    def open(self, clock: Clock, channels: tuple[str, ...]) -> None:
+        self.close()
+        try:
+            device = self._device_of(channels)
+        except ValueError as fault:
+            raise ConfigError(f"bench.joints: {fault}.", hint="Give each joint its servo.") from fault
+        self._device, self._clock, self._next = device, clock, clock.now()
+        try:
+            device.open(clock)
+            holding = list(device.state().angles)
+            if holding and self._settings.torque == "refuse":
+                text = f"{', '.join(holding)} hold, expected servos without torque, which can be guided by hand."
+                hint = "Hold the arm, and give bench.joints: {torque: release}, which lets them go."
+                raise DeviceRefusedError(text, hint=hint)
+            for joint in reversed(holding):
+                device.release(joint)
+        except DeviceLostError as fault:
+            self.close()
+            raise DeviceRefusedError(fault.message, where=fault.where, hint=fault.hint) from fault
+        except BaseException:
+            self.close()
+            raise
+
+    @override
+    def samples(self) -> list[JointSample]:
+        if self._device is None or (now := self._clock.now()) < self._next:
+            return []
+        self._next = now + 1 / self._settings.rate_hz
+        try:
+            return [JointSample(now, None, self._device.measured())]
+        except DeviceError as fault:
+            self._refused[fault.message] += 1
+            self._next = now + _AGAIN_S
+        try:
+            self.reopen(self._device)
+        except (DeviceError, DeviceRefusedError) as again:
+            self._refused[again.message] += 1
+        return []
+
+    @property
+    @override
+    def ended(self) -> bool:
+        return self._device is None
+
+    @property
+    @override
+    def refused(self) -> Mapping[str, int]:
+        return dict(self._refused)
+
+    @override
+    def close(self) -> None:
+        if self._device is not None:
+            self._device.close()
+        self._device = None
 
 
 REPEATED = "a repeated frame number"  # in ``Tracker.refused``, for frames that came before

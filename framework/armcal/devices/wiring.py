@@ -39,10 +39,10 @@ class WiringRecord:
     @classmethod
     def of_config(cls, source: ConfigSource, joints: Iterable[str]) -> WiringRecord:
         """Of ``bench.device.joints``; what was checked on a simulated bench is not checked on a real one."""
-        device = {key: value for key, value in _section(source, "device").items() if key != "port"}
+        device = {key: value for key, value in bench_section(source, "device").items() if key != "port"}
         stated = device.get("joints")
         parts = {key.rpartition(".")[2]: part for key, part in stated.items()} if isinstance(stated, dict) else {}
-        is_real = _section(source).get("simulated") is None
+        is_real = bench_section(source).get("simulated") is None
         names = [joint.rpartition(".")[2] for joint in joints]
         texts = {n: json.dumps(plain([parts.get(n, device), is_real]), sort_keys=True, default=str) for n in names}
         return cls(source.path, {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()})
@@ -127,12 +127,12 @@ def wiring_of(source: ConfigSource, device: JointDevice) -> WiringRecord | None:
 
 def servo_file_of(source: ConfigSource) -> Path | None:
     """The servo file of a bench's device; None where it has none."""
-    stated = _section(source, "device").get("servos")
+    stated = bench_section(source, "device").get("servos")
     return resolve_path(stated) if isinstance(stated, str) else None
 
 
-def _section(source: ConfigSource, *parts: str) -> dict[str, Any]:
-    """Of the bench, or a part of it, as it is written; empty where there is none."""
+def bench_section(source: ConfigSource, *parts: str) -> dict[str, Any]:
+    """The bench of a configuration, or a part of it, as it is written; empty where there is none."""
     section: Any = source.data
     for part in ("bench", *parts):
         section = section.get(part) if isinstance(section, dict) else None

@@ -13,7 +13,6 @@ from armcal.errors import ArmcalError, DataError, InputError
 from armcal.plugins import discover
 from armcal_lerobot.command import lerobot
 from armcal_lerobot.motor_files import Gripper, Motor, wiring_of
-from armcal_servobus.joints import drivable
 from click.testing import CliRunner
 
 from tests.plugins.lerobot.planted import motor_entries, write_motors
@@ -177,7 +176,8 @@ def test_a_whole_turn_is_sound_where_the_joint_turns_freely(tmp_path: Path) -> N
     assert not json_of("check", file, "--arm", config)["notes"]
     device = yaml.safe_load(called("joints", file, "--arm", config))["bench"]["device"]
     chosen = discover().find("device", device.pop("type")).load().Settings.model_validate(device)
-    drivable(chosen.chosen(joints).values())
+    for joint in chosen.chosen(joints).values():
+        joint.require_drivable()
     assert not json_of("check", write_motors(tmp_path / "two.json"))["notes"]  # its wrist_roll is a whole turn
 
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 from armcal.devices.device import DeviceError, DeviceLostError, DeviceRefusedError
-from armcal_servobus.bus import Bus, BusSettings, FoundServo, looked_at, present
+from armcal_servobus.bus import Bus, BusSettings, FoundServo
 
 from tests.plugins.servobus.fake_bus import FakeBus, sts, xl430
 
@@ -20,7 +20,7 @@ def opened(fake: FakeBus, **settings: object) -> Bus:
 
 
 def servos_on(bus: Bus, ids=range(31)) -> list[FoundServo]:
-    return [servo for servo in (looked_at(bus, number) for number in present(bus, ids)) if servo is not None]
+    return [servo for servo in (bus.looked_at(number) for number in bus.present(ids)) if servo is not None]
 
 
 class Faulty:
@@ -47,7 +47,7 @@ def lost(answer: bytes) -> bytes:
 def test_reads_and_writes(protocol, servo, place, echoes):
     with FakeBus([servo(1, 100), servo(2, 300)], protocol, echoes) as fake:
         bus = opened(fake)
-        assert present(bus, range(4)) == [1, 2] and bus.read(2, place, 2) == (300).to_bytes(2, "little")
+        assert bus.present(range(4)) == [1, 2] and bus.read(2, place, 2) == (300).to_bytes(2, "little")
         bus.write(1, 36, b"\x07")
         assert fake.servos[0].memory[36] == 7
         data = bus.read_all([2, 1], place, 2)
@@ -62,7 +62,7 @@ def test_a_ping_whose_echo_looks_like_an_answer_finds_nobody():
     """FF FF 01 02 01 FB is a ping of id 1, and the answer of a servo 1 that lacks voltage."""
     with FakeBus([sts(2)], echoes=True) as fake:
         bus = opened(fake, reply_ms=10)
-        assert present(bus, range(4)) == [2]
+        assert bus.present(range(4)) == [2]
         bus.close()
 
 

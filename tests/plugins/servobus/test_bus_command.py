@@ -14,7 +14,7 @@ from armcal.config.yaml_source import load_config
 from armcal.devices.wiring import WiringRecord
 from armcal.errors import InputError
 from armcal_servobus.command import planned
-from armcal_servobus.joints import ServoJointsSettings, Servos
+from armcal_servobus.device import ServoJointsSettings, Servos
 from click.testing import CliRunner, Result
 
 from tests.plugins.servobus.fake_bus import FakeBus, sts

@@ -11,7 +11,7 @@ import tty
 
 import pytest
 from armcal.devices.device import DeviceError
-from armcal_servobus.bus import Bus, BusSettings, looked_at, present
+from armcal_servobus.bus import Bus, BusSettings
 from armcal_servobus.device import ServoBusDevice
 from servo_bus_parts import BusOnDesk
 
@@ -120,14 +120,14 @@ def test_they_are_found(desk):
     protocol = desk.servos[0].table.protocol
     bus = Bus(BusSettings.model_validate({"port": desk.path, "baud": desk.baud, "protocol": protocol, "reply_ms": 60}))
     bus.open()
-    there = [looked_at(bus, servo) for servo in present(bus, range(4))]
+    there = [bus.looked_at(servo) for servo in bus.present(range(4))]
     assert [(servo.id, servo.model) for servo in there] == [
         (1, desk.servos[0].table.name),
         (2, desk.servos[1].table.name),
     ]
     assert not any(servo.doubled or servo.alarms for servo in there)
     desk.servos[1]._put("id", 1)
-    (both,) = (looked_at(bus, servo) for servo in present(bus, range(4)))
+    (both,) = (bus.looked_at(servo) for servo in bus.present(range(4)))
     assert both.id == 1 and both.doubled
     bus.close()
 

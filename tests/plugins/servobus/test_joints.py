@@ -7,8 +7,7 @@ import math
 import pytest
 from armcal.devices.device import DeviceRefusedError
 from armcal_servobus.bus import MODELS
-from armcal_servobus.device import ServoBusSettings
-from armcal_servobus.joints import ServoJoint, drivable
+from armcal_servobus.device import ServoBusSettings, ServoJoint
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -26,7 +25,7 @@ def joint(**settings: object) -> ServoJoint:
 def test_a_range_over_the_seam_is_read_whole(zero, degrees):
     made = joint(zero_count=zero)
     raw = (zero + round(math.radians(degrees) / STEP)) % 4096
-    assert math.degrees(made.angle(made.unwrapped(raw))) == pytest.approx(degrees, abs=0.05)
+    assert math.degrees(made.measured(raw)) == pytest.approx(degrees, abs=0.05)
 
 
 @given(st.floats(-100, 100), st.sampled_from([1, -1]))
@@ -47,14 +46,14 @@ def test_angles_out_of_range_are_refused(degrees):
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_whole_turn_can_be_driven(zero, direction):
     whole = joint(zero_count=zero, range_deg=[-180, 180], direction=direction)
-    drivable([whole])
+    whole.require_drivable()
     assert whole.count_range == (0, 4095) and {whole.count(-math.pi), whole.count(math.pi)} <= {0, 4095}
 
 
 def test_a_range_over_the_seam_cannot_be_driven():
-    drivable([joint()])
+    joint().require_drivable()
     with pytest.raises(ValueError, match=r"counts -937 to 1337, expected 0 to 4095.*homing offsets"):
-        drivable([joint(zero_count=200)])
+        joint(zero_count=200).require_drivable()
 
 
 def test_an_offset_beyond_the_register_is_refused_with_what_to_do():

@@ -199,6 +199,19 @@ def test_a_blocked_joint_is_named_after_a_second():
         made.keep_alive()  # on its way home it is not stopped again
 
 
+def test_a_goal_for_a_device_that_is_not_open_is_not_sent_afterwards():
+    with FakeBus([sts(1), sts(2)]) as fake:
+        made, clock = energised(fake)
+        made.close()
+        for move in (lambda: made.command({"q1": 0.5}), lambda: made.energise("q1", 0.5), made.keep_alive, made.state):
+            with pytest.raises(DeviceLostError):
+                move()
+        made.open(clock)
+        made.keep_alive()
+        assert made.state().angles == made.standing({"q1": 0.0, "q2": 0.0})
+        made.close()
+
+
 def test_a_goal_that_was_lost_is_sent_again():
     with FakeBus([sts(1), sts(2)]) as fake:
         made, _ = energised(fake)
