@@ -13,7 +13,7 @@ import click
 import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
-from armcal.errors import DataError, InputError, Location
+from armcal.errors import ConfigError, DataError, InputError, Location, PluginError
 from armcal.io.journal import JOURNAL_FILES, Journal, KeptJournal, has_journal
 from armcal.io.json_server import JsonClient
 from armcal.io.lines import StandardOutput
@@ -204,8 +204,14 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
         raise DataError("the journal does not hold its calibration whole.", where=Location(str(path)), hint=hint)
     # Nothing of the past goes for a roll-back after the end.
     stated = yaml.safe_dump({**header["settings"], "journal": {"total_bytes": 1 << 62}})
-    settings = load_settings(path, (), stated.encode())
-    session = Recalibrator(Calibration.load(path, registry, content=text), settings, registry)
+    try:
+        settings = load_settings(path, (), stated.encode())
+        session = Recalibrator(Calibration.load(path, registry, content=text), settings, registry)
+    except (ConfigError, PluginError) as fault:
+        where = Location(str(path), field=fault.where.field if fault.where else None)
+        again = "Roll back with the version of armcal that wrote it, or take another copy of the journal."
+        hint = fault.hint if isinstance(fault, PluginError) else again
+        raise type(fault)(fault.message, where=where, hint=hint) from fault
     source = Sent(RowParser(session.request, {}))
     with opened(folder, header, session, source, StandardOutput(None)) as loop:
         reply = loop.roll_back(to)
