@@ -255,7 +255,7 @@ WITH = {
     "ros2": "import rosbags.rosbag2, rosbags.typesys",
     "docs": "import mkdocs, material, pymdownx, latex2mathml",
     "dev": "import ruff, mypy.api, yaml",
-    "test": "import pytest, hatchling, xdist, hypothesis, pinocchio, distributed",
+    "test": "import pytest, hatchling, xdist, hypothesis, pinocchio",
     "bench": "import figaroh, pinocchio",
 }
 """What works with an extra and not without it."""

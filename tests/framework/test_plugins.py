@@ -75,8 +75,9 @@ NOT_RUN = {
     "camera": ("its settings have no path", "no known file was read"),
     "ros2": ("it reads no plain table", "no known file was read"),
     "servobus": ("no such serial port", "could feed it"),
+    "tracker": ("it reads no plain table", "no known file was read"),
 }
-"""Why checks of a plugin are not run: it reads folders or recordings, or a bus of its own, and has tests of its own."""
+"""Why checks of a plugin are not run: it reads folders, recordings or samples, or a bus of its own, and has tests of its own."""
 
 
 @pytest.mark.slow

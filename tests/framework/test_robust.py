@@ -330,7 +330,7 @@ def test_a_record_that_was_set_aside_wrongly_comes_back(lrm):
     weights[np.flatnonzero(~wrong)[:6]] = 0.0
     solution = IPOPT.solve(problem.with_records(records).weighted([weights]), start)
     found = robust.selected(
-        problem.with_records(records), IPOPT, robust.RobustFit(solution, (weights,), (1.0,), ()), 0.1
+        problem.with_records(records), IPOPT, robust.RobustFit(solution, (weights,), (1.0,), 0), 0.1
     )
     np.testing.assert_array_equal(found.weights[0] == 0, wrong)
 
