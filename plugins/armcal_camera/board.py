@@ -54,8 +54,6 @@ def tags_in(family: str) -> int:
 
 @dataclass(frozen=True)
 class Layout:
-    """What is printed of a board."""
-
     points: Array  # where its points are (P x 3, m, in the board's frame; z = 0)
     extent: tuple[float, float]  # width and height of what is printed, without a margin (m)
     step: float  # the distance of neighbouring points (m)

@@ -47,8 +47,6 @@ _FEWEST_VIEWS, _MOST_VIEWS = 3, 30
 
 
 class _View(NamedTuple):
-    """A board in a record."""
-
     record: int
     board: int
     points: Array  # on the board (n x 2, m)
@@ -177,7 +175,6 @@ def _pose_values(name: str, pose: Array) -> dict[str, Array]:
 
 
 def _middle(poses: Array) -> int:
-    """Of poses that should be one (N x 4 x 4), the one nearest to the others."""
     apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2)
     return int(np.argmin(np.median(apart, axis=1)))
 
@@ -312,12 +309,10 @@ class Camera(PointInstrument):
 
     @property
     def camera_frame(self) -> str:
-        """In which frame the camera is: ``base``, or that which carries it."""
         return self.settings.frame if self.settings.mounting == "eye_in_hand" else BASE_FRAME
 
     @property
     def board_frame(self) -> str:
-        """In which frame the boards are: ``base``, or that which carries them."""
         return self.settings.board_frame or (
             BASE_FRAME if self.settings.mounting == "eye_in_hand" else self.settings.frame
         )

@@ -447,7 +447,6 @@ def _turned(known: Array, pixels: Array) -> tuple[Array, float]:
 
 
 def _judged(detection: Detection, board: Board) -> Detection:
-    """The detection with its quality, and a fault if that is not enough."""
     if detection.fault:
         return detection
     seen = np.isfinite(detection.corners[:, 0])

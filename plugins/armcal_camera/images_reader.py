@@ -242,7 +242,6 @@ def _matched(dataset: Dataset, views: Mapping[str, View], place: str, count: int
 
 
 def _corner_channels(camera: str, corners: Array, known: Collection[str]) -> dict[str, Array]:
-    """The channels of a camera that are asked for, of corners in images (K x N x 2, px)."""
     values = from_unit(corners, "px")
     return {
         f"{camera}.{axis}_{k}": np.ascontiguousarray(values[k, :, i])
@@ -395,7 +394,6 @@ class LiveImages(LiveCamera):
         return self._shot(view, content, path.suffix.lower(), path.name)
 
     def _shot(self, view: View, content: bytes, suffix: str, name: str) -> Shot:
-        """An image, judged beside those before."""
         key = f"{len(self._views)}"
         view = _as_the_others({**self._views, key: view})[key]
         if view.fault:

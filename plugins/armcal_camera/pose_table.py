@@ -251,7 +251,6 @@ def _flange_poses(reader: Any, arm: Arm, first: Mapping[str, float], request: Re
 
 
 def _rows(text: str) -> list[tuple[int, list[str]]]:
-    """Lines with their numbers and cells, without empty lines and comments; four lines of four cells are one."""
     written = ((i, line.replace(",", " ").split()) for i, line in enumerate(text.splitlines(), start=1))
     rows = [(i, cells) for i, cells in written if cells and not cells[0].startswith("#")]
     if len(rows) % 4 or any(len(cells) != 4 for _, cells in rows):

@@ -104,7 +104,6 @@ _USUAL = Exposure(blur=0.7, noise=2.0, light=0.1)
 
 
 def rendered_records(camera: Any, frames: Mapping[str, Array], values: Mapping[str, Array]) -> Iterator[bytes]:
-    """The image file of each record; see ``Rendering``."""
     if any(float(values[f"{name}_bend_{axis}"][0]) for name in camera.board_names for axis in "xy"):
         raise ConfigError("found a board that is bent, expected flat ones: images are drawn of these alone.")
     kpx = 1000.0
