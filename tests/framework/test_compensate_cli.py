@@ -363,14 +363,14 @@ def test_limits_of_the_plan_are_kept(tmp_path: Path) -> None:
     written(given, desk)
     bench = Bench.of(Calibration.load(desk), None, CONFIGS / "lrm_arm" / "plan.yaml", discover())
     assert bench.options.limits["q2"] == pytest.approx((-np.radians(50), np.radians(50)))
-    assert bench.space.allowed is not None
+    assert bench.options.allowed is not None
     found = bench.compensator()
     q = drawn(found, 60)
-    q = q[bench.space.allowed(q.T)][:4]
+    q = q[bench.options.allowed(q.T)][:4]
     assert len(q) == 4
     commands = found.solve(found.targets(found.forward(q)[:, :3, 3]))
     assert commands.reached.all()
-    assert bench.space.allowed(commands.joint_angles.T).all()
+    assert bench.options.allowed(commands.joint_angles.T).all()
     assert (np.abs(commands.joint_angles[:, 1]) <= np.radians(50) + 1e-12).all()
 
 

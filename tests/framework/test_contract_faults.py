@@ -92,7 +92,7 @@ FAULTS = [
     ("estimator", SOLVING, "IgnoresPriors", "weighs records and priors"),
     ("estimator", SOLVING, "StartsFromTheLastAnswer", "the same each time"),
     ("estimator", SOLVING, "MovesItsStart", "changed the start"),
-    ("online", SOLVING, "ForgetsTheGainTwice", "prior and records say together"),
+    ("online", SOLVING, "ForgetsTheGainTwice", "prior and record say together"),
     ("online", SOLVING, "MakesVariancesPositive", "variance below zero"),
     ("online", SOLVING, "RemembersTheLastBelief", "the same each time"),
     ("exporter", SOLVING, "StampsItsContent", "the same each time"),

@@ -77,7 +77,7 @@ NOT_RUN = {
     "servobus": ("no such serial port", "could feed it"),
     "tracker": ("it reads no plain table", "no known file was read"),
 }
-"""Why checks of a plugin are not run: it reads folders, recordings or samples, or a bus of its own, and has tests of its own."""
+"""Why checks of a plugin are not run: it reads folders, recordings, samples or a bus, and has tests of its own."""
 
 
 @pytest.mark.slow
