@@ -176,6 +176,8 @@ def _can_be_placed(problem: Problem, number: int) -> bool:
     """Whether free parameters move all positions of a factor alike, along each axis, to first order."""
     noise = np.array(problem.kernels[number].factor.noise[:3])
     slopes = problem.jacobians(problem.parameters.nominal())[number][:3] * noise[:, None, None]
+    if not slopes.shape[1]:
+        return False
     rows = slopes.transpose(2, 0, 1).reshape(-1, slopes.shape[1])
     shifts = np.tile(np.eye(3), (slopes.shape[2], 1))
     left = shifts - rows @ np.linalg.lstsq(rows, shifts, rcond=1e-9)[0]
