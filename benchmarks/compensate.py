@@ -46,7 +46,8 @@ class TrueArm:
     def of(cls, config: str) -> TrueArm:
         """That of a configuration in configs/lrm_arm, with the shipped truth."""
         experiment = Experiment.load(CONFIGS / config)
-        truth = with_values(experiment.parameters, load_config(CONFIGS / "truth.yaml").data, None, ())
+        stated = load_config(CONFIGS / "truth.yaml")
+        truth = with_values(experiment.parameters, stated.data, stated, ())
         return cls(experiment, truth)
 
     def compensator(self, choice: EvaluatorChoice = "compiled") -> Compensator:

@@ -170,8 +170,8 @@ def _panda() -> _Subject:
 def _lrm() -> _Subject:
     experiment = Experiment.load(CONFIGS / "lrm_arm" / "demo.yaml")
     arm = experiment.system.arms["arm"]
-    truth = load_config(CONFIGS / "lrm_arm" / "truth.yaml").data
-    parameters = with_values(experiment.system.parameters(), truth, None, ())
+    truth = load_config(CONFIGS / "lrm_arm" / "truth.yaml")
+    parameters = with_values(experiment.system.parameters(), truth.data, truth, ())
     own = {block.name for block in arm.parameters()}
     values = {b.name: np.array(b.nominal) for b in parameters.blocks if b.name in own}
     return _subject(arm, values, experiment)

@@ -50,5 +50,6 @@ def simulated(records: int, also_free: Sequence[str] = ()) -> Case:
     parameters = experiment.parameters.with_free([*free, *also_free])
     system = experiment.system
     request = SimulationRequest(system.arms, system.measurements, parameters, system.environment)
-    truth = with_values(parameters, load_config(CONFIGS / "truth.yaml").data, None, ()).nominal()
+    stated = load_config(CONFIGS / "truth.yaml")
+    truth = with_values(parameters, stated.data, stated, ()).nominal()
     return Case(experiment, parameters, experiment.simulator().simulate(request), truth)

@@ -7,7 +7,9 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
 from armcal.errors import DataError
 from armcal.io.lines import StandardOutput
@@ -19,7 +21,8 @@ from armcal_online.sources import Lines, RowParser, open_source
 
 HEADER = "pose_id,q1_deg,q2_deg,x_mm,y_mm,z_mm"
 CALIBRATION = "armcal_calibration: 0\n"
-loop.CALIBRATION_GAP_S, loop.STATUS_S, loop.CHECKPOINT_RECORDS = 0.0, 0.05, 25
+PACE = {"CALIBRATION_GAP_S": 0.0, "STATUS_S": 0.05, "CHECKPOINT_RECORDS": 25}
+"""In place of the loop's own, while a fake runs."""
 
 
 def request():
@@ -52,7 +55,9 @@ class FakeRecalibrator:
         self.total = 0.1 + differs
         self.count = 0
 
-    def take(self, incoming, sequence):
+    def take(self, incoming, sequence, passed_over=""):
+        if passed_over:
+            return ({**self._event(incoming, sequence, "ignored"), "why": f"Passed over: {passed_over}."},)
         if incoming.record_id == "refused":
             raise DataError("it is refused.")
         if incoming.fault:
@@ -92,14 +97,16 @@ class FakeRecalibrator:
         return {"event": "started", "level": "nominal"}
 
 
-def begun(folder, fake, source, stream=None):
+@contextmanager
+def begun(folder, fake, source, stream=None, pace=PACE):
     """A recalibration from a calibration that lies beside the folder."""
     calibration = Path(folder).with_suffix(".start.yaml")
     if not calibration.exists():
         calibration.parent.mkdir(parents=True, exist_ok=True)
         calibration.write_text(CALIBRATION)
     header = header_of(Path(folder), calibration, fake)
-    return opened(Path(folder), header, fake, source, StandardOutput(stream))
+    with patch.multiple(loop, **pace), opened(Path(folder), header, fake, source, StandardOutput(stream)) as going:
+        yield going
 
 
 def main(folder, source, at_end):

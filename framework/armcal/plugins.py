@@ -198,7 +198,7 @@ class PluginRegistry:
         known = sorted(own.name for own in self.components if own.kind == kind)
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"Did you mean {near[0]!r}?" if near else f"Known: {', '.join(known) or 'none'}."
-        if others := [spoken(own.kind) for own in self.components if own.name == name]:
+        if others := list(dict.fromkeys(spoken(own.kind) for own in self.components if own.name == name)):
             hint = f"It is registered as {' and '.join(others)}."
         hint += " A plugin's file is loaded by --plugin FILE."
         if self.faults:

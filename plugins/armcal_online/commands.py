@@ -14,7 +14,7 @@ import yaml
 from armcal.calibration.calibration import Calibration
 from armcal.cli.common import Console, overrides, speaking
 from armcal.errors import ConfigError, DataError, InputError, Location, PluginError
-from armcal.io.journal import JOURNAL_FILES, Journal, KeptJournal, has_journal
+from armcal.io.journal import JOURNAL_FILES, Entry, Journal, KeptJournal, has_journal
 from armcal.io.json_server import JsonClient
 from armcal.io.lines import StandardOutput
 from armcal.io.plain_files import check_folder
@@ -155,9 +155,10 @@ def opened(
                     hint="Give what it was begun with, or a new --out (perhaps from a copy of its calibration.yaml).",
                 )
         replayer, since = StateReplayer(session, journal), 0
-        if (checkpoint := journal.checkpoint) is None:
+        if journal.is_new:
             journal.put_checkpoint(replayer.checkpoint())
         else:
+            checkpoint = journal.checkpoint or Entry(0, "checkpoint", replayer.checkpoint())
             since = journal.sequence - checkpoint.sequence
             replayer.replay(checkpoint, journal.entries(checkpoint.sequence))
         source.resume(replayer.progress.positions)
@@ -199,9 +200,11 @@ def roll_back_ended(folder: Path, to: int | str, registry: PluginRegistry) -> Ma
             journal.until(to)
         header, path = journal.header, journal.path
     text = str(header.get("text", "")).encode()
-    if hashlib.sha256(text).hexdigest() != header.get("calibration") or not isinstance(header.get("settings"), dict):
+    is_whole = hashlib.sha256(text).hexdigest() == header.get("calibration")
+    if not is_whole or not isinstance(header.get("settings"), dict):
+        what = "settings" if is_whole else "calibration"
         hint = "Take another copy of the journal, or begin a new --out from its calibration.yaml."
-        raise DataError("the journal does not hold its calibration whole.", where=Location(str(path)), hint=hint)
+        raise DataError(f"the journal does not hold its {what} whole.", where=Location(str(path)), hint=hint)
     # Nothing of the past goes for a roll-back after the end.
     stated = yaml.safe_dump({**header["settings"], "journal": {"total_bytes": 1 << 62}})
     try:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ STARTED, RECORD, ROLLBACK, PAUSE, RESUME = "started", "record", "rollback", "pau
 NOTED = ("decision", "level")  # events that are entries too
 GOOD = "good"  # in place of a sequence number: that of the last good record
 COMMANDS = ("status", PAUSE, RESUME, ROLLBACK, "finish")
+BUSY = ("a recalibration is running here.", "Give another --out.")
 Event = dict[str, Any]
 
 
@@ -85,13 +86,17 @@ class StateReplayer:
         return {"state": self._session.snapshot(), "progress": asdict(self.progress)}
 
     def replay(self, checkpoint: Entry, entries: Iterable[Entry]) -> None:
-        sequence = checkpoint.sequence
-        try:
+        with self._parsing(checkpoint.sequence):
             self.progress = Progress(**checkpoint.content["progress"])
             self._session.restore(checkpoint.content["state"])
-            for entry in entries:
-                sequence = entry.sequence
-                self.apply(sequence, entry.kind, entry.content)
+        for entry in entries:
+            self.apply(entry.sequence, entry.kind, entry.content)
+
+    @contextmanager
+    def _parsing(self, sequence: int) -> Iterator[None]:
+        """Around the reading of an entry alone: what fails as it acts is no fault of the journal."""
+        try:
+            yield
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as fault:
             why = f"entry {sequence} is whole, but none that this version writes ({type(fault).__name__}: {fault})."
             hint = "Read it with the version of armcal that wrote it, or begin a new --out from its calibration.yaml."
@@ -99,13 +104,14 @@ class StateReplayer:
 
     def apply(self, sequence: int, kind: str, content: Mapping[str, Any]) -> tuple[Event, ...]:
         if kind == RECORD:
-            incoming = Incoming.from_dict(content)
-            repeated = self.progress.repeated(incoming) is not None
+            with self._parsing(sequence):
+                incoming = Incoming.from_dict(content)
+                repeated = self.progress.repeated(incoming) is not None
             self.progress.take(incoming, sequence)
-            why = "Passed over: the same record came before." if repeated else "The recalibration is paused."
-            if not repeated and not self.progress.paused:
+            why = "The recalibration is paused."
+            if not self.progress.paused:
                 try:
-                    return self._session.take(incoming, sequence)
+                    return self._session.take(incoming, sequence, "the same record came before" if repeated else "")
                 except ArmcalError as fault:
                     why = f"It could not be used: {fault}"
             event = {"event": RECORD, "sequence": sequence, "id": incoming.record_id, "at": incoming.arrived}
@@ -113,7 +119,9 @@ class StateReplayer:
         if kind in (PAUSE, RESUME):
             self.progress.paused = kind == PAUSE
         elif kind == ROLLBACK:
-            self.go_back(int(content["to"]))
+            with self._parsing(sequence):
+                to = int(content["to"])
+            self.go_back(to)
         return ()
 
     def go_back(self, sequence: int) -> None:
@@ -170,8 +178,14 @@ class Outputs:
         with suppress(FileNotFoundError):
             if path.stat().st_size + len(line) > EVENT_BYTES:
                 path.replace(self.folder / EARLIER)
-        with path.open("ab") as file:
-            file.write(line)
+        with path.open("ab", 0) as file:
+            whole = file.tell()
+            try:
+                while line:
+                    line = line[file.write(line) :]
+            except OSError:  # no half line before what comes next
+                os.ftruncate(file.fileno(), whole)
+                raise
 
     def _replace_calibration(self, data: bytes) -> None:
         write_whole(self.folder / CALIBRATION, data)
@@ -201,7 +215,8 @@ class Outputs:
         except OSError as fault:
             if name not in self._troubled:
                 self._troubled.add(name)
-                self._alarm(name, f"{name} cannot be written ({fault.strerror}); it is tried again.")
+                stands = "" if name == EVENTS else "; the one before stands"
+                self._alarm(name, f"{name} cannot be written ({fault.strerror}){stands}, and it is tried again.")
             return False
         if name in self._troubled:
             self._troubled.discard(name)
@@ -227,8 +242,7 @@ class Recalibration:
         self.sequence = journal.sequence  # of the last entry that changed anything
         self.finishing = ""  # why it is about to end; empty while it is not
         self._fault: Exception | None = None  # of a record that a program sent
-        busy = ("a recalibration is running here.", "Give another --out.")
-        self.control = JsonServer.at(outputs.folder / SOCKET, *busy, self.answer)
+        self.control = JsonServer.at(outputs.folder / SOCKET, *BUSY, self.answer)
 
     @property
     def paused(self) -> bool:

@@ -97,7 +97,10 @@ class Recalibrator:
         rows = zip(names, values, deviations(space, self.state.belief).tolist(), strict=True)
         return {name: [value, sd] for name, value, sd in rows if sd > 0 or name not in held}
 
-    def take(self, incoming: Incoming, sequence: int) -> tuple[dict[str, Any], ...]:
+    def take(self, incoming: Incoming, sequence: int, passed_over: str = "") -> tuple[dict[str, Any], ...]:
+        """The events of a record; ``passed_over`` is why it counts as ignored before it is looked at."""
+        if passed_over:
+            return self._ignored(incoming, replace(self.state, sequence=sequence), passed_over)
         time = incoming.channels.get("time")
         time = time if time is not None and math.isfinite(time) else None
         tick = ticked(self.state.clock, time, incoming.arrived, self.settings.clock)

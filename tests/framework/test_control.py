@@ -17,7 +17,7 @@ from armcal.errors import InputError
 from armcal.io.json_server import MOST_CLIENTS, JsonServer
 from armcal_online.commands import ask
 from armcal_online.decisions import SOCKET
-from armcal_online.loop import Recalibration
+from armcal_online.loop import BUSY, Recalibration
 from click.testing import CliRunner
 
 
@@ -28,7 +28,7 @@ def echo(content: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def control_server(folder: Path, answer: Callable[[Any], Mapping[str, Any]] = echo) -> JsonServer:
-    return JsonServer.at(folder / SOCKET, "a recalibration is running here.", "Give another --out.", answer)
+    return JsonServer.at(folder / SOCKET, *BUSY, answer)
 
 
 @contextmanager

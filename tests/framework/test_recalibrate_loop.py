@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import resource
+import sqlite3
 import time
 from dataclasses import replace
 from io import BytesIO
@@ -11,8 +13,8 @@ from typing import Any
 
 import pytest
 from armcal.errors import InputError
-from armcal.io.journal import Journal, JournalFullError, KeptJournal
-from armcal_online import loop
+from armcal.io.journal import JOURNAL, Journal, JournalFullError, KeptJournal
+from armcal_online.decisions import EVENTS
 from armcal_online.loop import Recalibration
 from armcal_online.settings import RecalibrateSettings
 from armcal_online.sources import Incoming, RowParser, Sent, open_source
@@ -260,19 +262,56 @@ def test_a_full_journal_stops_it_says_so_and_keeps_all_that_was_acknowledged(tmp
 
 def test_a_crash_is_told_to_whoever_watches_and_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with stepping(tmp_path / "out", Listed(made(1, 9))) as (going, fake):
-        monkeypatch.setattr(fake, "take", lambda incoming, sequence: 1 / 0)
+        monkeypatch.setattr(fake, "take", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             going.run()
     assert "division by zero" in json.loads((tmp_path / "out" / "status.json").read_text())["fault"]
     assert "division by zero" in events(tmp_path / "out")[-1]["sentence"]
 
 
-def test_the_pace_of_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"CALIBRATION_GAP_S": 1.0, "STATUS_S": 1e9, "CHECKPOINT_RECORDS": 10}.items():
-        monkeypatch.setattr(loop, name, value)
+def test_a_fault_of_an_estimator_is_raised_after_a_restart_too_and_no_fault_of_the_journal(tmp_path: Path) -> None:
+    def broken(*_: object) -> None:
+        raise TypeError("a fault of a plugin")
+
+    for _ in range(2):
+        fake = FakeRecalibrator()
+        fake.take = broken  # type: ignore[assignment]
+        going = begun(tmp_path / "out", fake, Listed(made(1, 3)))
+        with pytest.raises(TypeError, match="a fault of a plugin"), going as recalibration:
+            recalibration.run()
+
+
+def test_a_journal_without_a_checkpoint_is_taken_up_from_its_first_entry(tmp_path: Path) -> None:
+    digest = run(tmp_path / "out", Listed(made(1, 6))).digest()
+    with sqlite3.connect(tmp_path / "out" / JOURNAL) as database:
+        database.execute("delete from checkpoint")
+    assert run(tmp_path / "out", Listed([])).digest() == digest
+
+
+def test_no_event_follows_half_a_line_where_a_disk_was_full_for_a_while(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with stepping(out, Listed(made(1, 9))) as (going, _):
+        steps(going, 3)
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        going._outputs.event({"event": "before"})
+        resource.setrlimit(resource.RLIMIT_FSIZE, ((out / EVENTS).stat().st_size + 20, before[1]))
+        try:
+            going._outputs.event({"event": "lost", "sentence": "longer than the room that is left"})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        going._outputs.event({"event": "after"})
+    assert [event["event"] for event in events(out)].count("after") == 1
+
+
+def test_the_pace_of_what_is_written(tmp_path: Path) -> None:
     settings = RecalibrateSettings(output={"calibration_every_records": 1000, "calibration_every_s": 1e9})
     folder = tmp_path / "out"
-    run(folder, Listed(made(1, 20)), settings)
+    run(
+        folder,
+        Listed(made(1, 20)),
+        settings,
+        pace={"CALIBRATION_GAP_S": 1.0, "STATUS_S": 1e9, "CHECKPOINT_RECORDS": 10},
+    )
     assert kinds(folder).count("calibration") == 2
     with KeptJournal(folder) as journal:
         found = {journal.until(e.sequence)[0].sequence for e in journal.entries()}

@@ -183,7 +183,7 @@ class Journal(KeptJournal):
             self._lock.acquire()
         except Timeout as fault:
             text = "another process writes this journal already."
-            hint = "End that process (see fuser), or give another folder; a journal can be read meanwhile."
+            hint = f"End that process, which `fuser {self.path}` names, or give another folder."
             raise InputError(text, where=Location(str(self.path)), hint=hint) from fault
         except OSError as fault:
             hint = "Give a writable folder on a disk that works."

@@ -90,7 +90,7 @@ class JsonClient(contextlib.ExitStack):
 
 
 class JsonServer:
-    """Serves clients: only while ``serve`` is called is anyone answered.
+    """Serves clients: only while ``serve`` is called is anyone answered, but for who sends a line that is too long.
 
     Args:
         answering: makes the answer to a line that came then (monotonic seconds), after None for each slice of work

@@ -4,12 +4,12 @@ No port is opened, for something may be plugged in. Live sources never wait; dam
 """
 
 import math
-import multiprocessing
 import socket
+import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, wait
 from contextlib import closing, suppress
 from copy import deepcopy
-from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -177,11 +177,18 @@ def damaged_bytes_are_passed_over_and_counted(s: Subject) -> None:
 
 def _within(call: Callable[[], T]) -> T:
     """What a call gives, if it does not wait."""
-    try:
-        return ThreadPool(1).apply_async(call).get(_PATIENCE_S)
-    except multiprocessing.TimeoutError as fault:
-        text = f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once"
-        raise ContractError(text) from fault
+    future = Future[T]()
+
+    def run() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as fault:
+            future.set_exception(fault)
+
+    threading.Thread(target=run, daemon=True).start()
+    wait([future], _PATIENCE_S)
+    expect(future.done(), f"found it still waiting after {_PATIENCE_S:g} s, expected what has come by now, at once")
+    return future.result()
 
 
 def _settings_to_feed(s: Subject, path: Path) -> Mapping[str, Any]:
